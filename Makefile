@@ -1,0 +1,28 @@
+VENV ?= .venv
+PYTHON ?= python3
+BIN := $(VENV)/bin
+
+.PHONY: setup test check demo clean
+
+setup: $(VENV)/.ready
+
+# One virtual environment with everything the tests and tools need.
+$(VENV)/.ready: pyproject.toml constraints.txt
+	rm -rf build
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[dev]"
+	mkdir -p .typing/idesplat
+	for package in model export runtime tools; do ln -sfn ../../$$package .typing/idesplat/$$package; done
+	touch $@
+
+# Lint, types and tests.
+test: check
+	$(BIN)/python -m pytest --quiet
+
+check: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy -p idesplat.model -p idesplat.export -p idesplat.runtime -p idesplat.tools
+
+clean:
+	rm -rf $(VENV) build .typing *.egg-info
