@@ -1,0 +1,275 @@
+"""Views: pictures and cameras brought together, the ones to use chosen, and the arrays the network takes."""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePath, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from .cameras import Camera, check_intrinsics, located, resized, rigid
+from .errors import InputError
+from .images import SUFFIXES, fit, load_image, undistort
+
+FEWEST_VIEWS = 2
+EXAMPLES = 3  # names listed in a message
+
+# The parallax of a good pair, seen from what both look at: wide enough to measure depth, narrow enough to match.
+GOOD_PARALLAX_DEG = 5.0
+# Viewing directions this far apart cost as much as a baseline twice too long or too short.
+TURN_DEG = 30.0
+# The share of the cameras' movement that a common point of view must explain to be believed.
+FOCUS_EXPLAINS = 0.5
+# The scene's distance where the cameras have no common point of view, in longest baselines.
+UNKNOWN_DISTANCE = 3.0
+
+SAME_PLACE = 1e-4  # of the longest baseline
+SAME_ROTATION = 1e-4  # largest difference of two rotation matrices
+FLOAT32_ROUNDING = 4 * float(np.finfo(np.float32).eps)  # of the distance from the origin
+RANGE_SLACK = 1e-3  # how far resampling may have carried a pixel outside [0, 1]
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """What the network takes, and the cameras it came from.
+
+    names: file names of the pictures, [views].
+    images: float32 RGB in [0, 1], [views, 3, height, width].
+    extrinsics: float32, camera-to-world, OpenCV axes, in the world frame and unit that the user gave, [views, 4, 4].
+    intrinsics: float32, row 0 divided by the width and row 1 by the height, [views, 3, 3].
+    cameras: the same cameras undistorted, at the full size of the pictures, [views].
+    """
+
+    names: list[str]
+    images: np.ndarray
+    extrinsics: np.ndarray
+    intrinsics: np.ndarray
+    cameras: list[Camera]
+
+
+def match(images: Sequence[Path], cameras: Sequence[Camera]) -> list[tuple[Path, Camera]]:
+    """Give each picture the camera that names it, in the order of the pictures; cameras may be left over.
+
+    Names are compared without suffix (a transforms.json often has none); of several such cameras the one with the same
+    suffix, then the one with more folders in common, is taken. The order of the two lists plays no part.
+    Raises InputError if a picture has no camera or several equally good ones, or two pictures have the same.
+    """
+    by_stem: dict[str, list[Camera]] = defaultdict(list)
+    for camera in cameras:
+        by_stem[_stem(_path(camera.name))].append(camera)
+    if not any(_stem(image) in by_stem for image in images):
+        raise InputError(
+            f"none of {len(images)} images ({_examples(images)}) is named by one of {len(cameras)} cameras "
+            f"({_examples([camera.name for camera in cameras])}); give the images that the cameras were made for"
+        )
+    taken: dict[str, Path] = {}
+    pairs = []
+    for image in images:
+        candidates = by_stem.get(_stem(image), [])
+        if not candidates:
+            names = _examples([camera.name for camera in cameras])
+            raise InputError(
+                f"{image}: none of {len(cameras)} cameras names it ({names}); leave it out or add its camera"
+            )
+        camera = _best(image, candidates)
+        if camera.name in taken:
+            raise InputError(f"{image} and {taken[camera.name]} both match the camera of {camera.name}; leave one out")
+        taken[camera.name] = image
+        pairs.append((image, camera))
+    return pairs
+
+
+def choose_views(extrinsics: np.ndarray, count: int) -> list[int]:
+    """Choose `count` cameras [cameras, 4, 4] that see a common region with good baselines; indices in rising order.
+
+    A pair is good when its parallax, seen from the scene, is near 5 degrees, and its viewing directions agree. The
+    best pair comes first; then, again and again, the camera that makes the best pair with its nearest chosen one.
+    The scene's distance is not known, so it is where the optical axes come closest to each other, or, where the
+    cameras do not look at a common place, three times the longest baseline. Ties go to the lower index.
+    Raises InputError if there are fewer cameras than asked for, or all stand at one place.
+    """
+    total = len(extrinsics)
+    if not FEWEST_VIEWS <= count <= total:
+        raise InputError(f"{count} views asked for, expected {FEWEST_VIEWS} to {total}, the number of images")
+    if count == total:
+        return list(range(total))
+    baselines = _baselines(extrinsics)  # [cameras, cameras]
+    cost = _pair_costs(extrinsics, baselines)  # [cameras, cameras]
+    if not np.isfinite(cost).any():
+        raise InputError("all cameras stand at one place, expected a baseline between them; depth needs one")
+    chosen = [int(index) for index in np.unravel_index(cost.argmin(), cost.shape)]
+    while len(chosen) < count:
+        rest = np.setdiff1d(np.arange(total), chosen)
+        nearest = np.array(chosen)[baselines[rest][:, chosen].argmin(axis=1)]  # [rest]
+        chosen.append(int(rest[cost[rest, nearest].argmin()]))
+    return sorted(chosen)
+
+
+def prepare(pairs: Sequence[tuple[Path, Camera]], count: int | None, height: int, width: int) -> Views:
+    """Read the pictures (only `count` well chosen ones, if given), undistort them and bring them to height x width.
+
+    Raises InputError for fewer than two views, two cameras at the same pose, cameras without any baseline, a picture
+    that cannot be read or has another size than its camera.
+    """
+    if len(pairs) < FEWEST_VIEWS:
+        raise InputError(f"{len(pairs)} image with a camera, expected at least {FEWEST_VIEWS}; add images")
+    if count is not None:
+        chosen = choose_views(np.stack([camera.extrinsics for _, camera in pairs]), count)
+        pairs = [pairs[index] for index in chosen]
+    extrinsics = np.stack([camera.extrinsics for _, camera in pairs])  # [views, 4, 4]
+    _check_distinct(extrinsics, [camera.name for _, camera in pairs])
+    cameras, images, intrinsics = [], [], []
+    for path, camera in pairs:
+        image = load_image(path)
+        with located(str(path)):
+            camera = resized(camera, image.shape[1], image.shape[0])
+        image, camera = undistort(image, camera)
+        pixels, normalised = fit(image, camera.K, height, width)
+        cameras.append(camera)
+        images.append(pixels)
+        intrinsics.append(normalised)
+    names = [path.name for path, _ in pairs]
+    return Views(names, np.stack(images), extrinsics.astype(np.float32), np.stack(intrinsics), cameras)
+
+
+def check_views(images: Any, extrinsics: Any, intrinsics: Any, near: Any, far: Any) -> None:
+    """Check what the network is given, as `Views` describes it; near and far are one number or one for each view.
+
+    Raises InputError naming the argument and the view: wrong shape or type, NaN, a pose that is not rigid, intrinsics
+    that are not normalised, pixels outside [0, 1], not 0 < near < far, fewer than two views, cameras that coincide.
+    """
+    images = _floats(images, "images", "[views, 3, height, width]", (None, 3, None, None))
+    views = len(images)
+    extrinsics = _floats(extrinsics, "extrinsics", "[views, 4, 4]", (views, 4, 4))
+    intrinsics = _floats(intrinsics, "intrinsics", "[views, 3, 3]", (views, 3, 3))
+    if views < FEWEST_VIEWS:
+        raise InputError(f"images: {views} view given, expected at least {FEWEST_VIEWS}")
+    low, high = images.min(), images.max()
+    if low < -RANGE_SLACK or high > 1 + RANGE_SLACK:
+        raise InputError(f"images: values from {low:g} to {high:g}, expected 0 to 1; divide 8-bit pixels by 255")
+    for index in range(views):
+        with located(f"extrinsics[{index}]"):
+            rigid(extrinsics[index])
+        with located(f"intrinsics[{index}], normalised (row 0 divided by the width, row 1 by the height)"):
+            check_intrinsics(intrinsics[index], 1, 1)
+    _check_distinct(extrinsics, [f"view {index}" for index in range(views)])
+    _check_range(near, far, views)
+
+
+# ---- matching names
+
+
+def _path(name: str) -> PurePosixPath:
+    return PurePosixPath(name.replace("\\", "/"))  # files written on Windows
+
+
+def _stem(path: PurePath) -> str:
+    """The name without an image's suffix; `r_0.5` has none."""
+    return path.stem if path.suffix.lower() in SUFFIXES else path.name
+
+
+def _best(image: Path, candidates: Sequence[Camera]) -> Camera:
+    """The candidate that agrees most with the image's path; raises InputError if two do equally."""
+    agreement = [_agreement(image, _path(camera.name)) for camera in candidates]
+    best = [camera for camera, value in zip(candidates, agreement, strict=True) if value == max(agreement)]
+    if len(best) > 1:
+        names = _examples([camera.name for camera in best])
+        raise InputError(f"{image}: {len(best)} cameras match it equally ({names}); give it under one of these paths")
+    return best[0]
+
+
+def _agreement(image: Path, name: PurePosixPath) -> tuple[bool, int]:
+    """Whether the file names are the same, and how many folders before them are."""
+    folders = 0
+    for ours, theirs in zip(reversed(image.parts[:-1]), reversed(name.parts[:-1]), strict=False):
+        if ours != theirs:
+            break
+        folders += 1
+    return image.name == name.name, folders
+
+
+def _examples(names: Sequence[object]) -> str:
+    return ", ".join(str(name) for name in names[:EXAMPLES]) + (", ..." if len(names) > EXAMPLES else "")
+
+
+# ---- poses
+
+
+def _baselines(extrinsics: np.ndarray) -> np.ndarray:
+    """Distances between cameras, [cameras, cameras]."""
+    positions = extrinsics[:, :3, 3]
+    return np.linalg.norm(positions[:, None] - positions[None], axis=-1)
+
+
+def _pair_costs(extrinsics: np.ndarray, baselines: np.ndarray) -> np.ndarray:
+    """How far each pair is from a good one, [cameras, cameras]; infinite without a baseline."""
+    forward = extrinsics[:, :3, 2]
+    parallax = np.degrees(2 * np.arctan2(baselines, 2 * _scene_distance(extrinsics, baselines)))
+    turn = np.degrees(np.arccos(np.clip(forward @ forward.T, -1, 1)))
+    with np.errstate(divide="ignore"):
+        cost = np.abs(np.log2(parallax / GOOD_PARALLAX_DEG)) + (turn / TURN_DEG) ** 2
+    return np.round(cost, 6)  # equally good pairs are equal whatever the rounding of their poses
+
+
+def _scene_distance(extrinsics: np.ndarray, baselines: np.ndarray) -> float:
+    """Distance at which points on the optical axes come closest to each other, by least squares."""
+    positions = extrinsics[:, :3, 3] - extrinsics[:, :3, 3].mean(axis=0)
+    forward = extrinsics[:, :3, 2] - extrinsics[:, :3, 2].mean(axis=0)
+    # |positions + distance * forward|^2 is least at distance = -joint / (forward * forward), having lost this share:
+    joint, movement, turning = (positions * forward).sum(), (positions**2).sum(), (forward**2).sum()
+    if joint < 0 and joint**2 > FOCUS_EXPLAINS * movement * turning:
+        return float(-joint / turning)
+    return UNKNOWN_DISTANCE * float(baselines.max())
+
+
+def _check_distinct(extrinsics: np.ndarray, names: Sequence[str]) -> None:
+    """Refuse cameras without any baseline, and two cameras at one pose."""
+    baselines = _baselines(extrinsics)
+    rounding = FLOAT32_ROUNDING * float(np.abs(extrinsics[:, :3, 3]).max())
+    if baselines.max() <= rounding:
+        raise InputError(
+            f"{names[0]} and {names[1]} stand at the same place, as do all cameras; depth needs a baseline"
+        )
+    rotations = extrinsics[:, :3, :3]
+    for first in range(len(extrinsics)):
+        same_rotation = np.abs(rotations - rotations[first]).max(axis=(1, 2)) <= SAME_ROTATION
+        same_place = baselines[first] <= max(SAME_PLACE * baselines.max(), rounding)
+        for second in range(first + 1, len(extrinsics)):
+            if same_rotation[second] and same_place[second]:
+                raise InputError(f"{names[first]} and {names[second]} have the same pose, expected two; leave one out")
+
+
+# ---- arrays
+
+
+def _floats(array: Any, name: str, expected: str, shape: tuple[int | None, ...]) -> np.ndarray:
+    """The argument as an array, once its type, shape (None: any) and values are in order."""
+    try:
+        array = np.asarray(array)
+    except ValueError:  # rows of different lengths
+        raise InputError(f"{name}: not an array, expected {expected}") from None
+    if not np.issubdtype(array.dtype, np.floating):
+        raise InputError(f"{name}: type {array.dtype}, expected float32, {expected}")
+    fits = array.ndim == len(shape) and all(b in (None, a) for a, b in zip(array.shape, shape, strict=True))
+    if not fits or array.size == 0:
+        given = f", {shape[0]} views being given" if shape[0] is not None else ""
+        raise InputError(f"{name}: shape {array.shape}, expected {expected}{given}")
+    if not np.isfinite(array).all():
+        view = int(np.argwhere(~np.isfinite(array))[0, 0])
+        raise InputError(f"{name}[{view}]: holds NaN or infinity, expected finite numbers")
+    return array
+
+
+def _check_range(near: Any, far: Any, views: int) -> None:
+    for name, value in (("near", near), ("far", far)):
+        array = np.asarray(value)
+        if array.dtype.kind not in "fiu" or array.shape not in ((), (views,)):
+            raise InputError(f"{name}: {array.dtype}, shape {array.shape}, expected a number, or {views} of them")
+        if not np.isfinite(array).all():
+            raise InputError(f"{name}: holds NaN or infinity, expected finite distances")
+    nearest, farthest = np.broadcast_arrays(np.asarray(near), np.asarray(far))
+    if nearest.min() <= 0:
+        raise InputError(f"near: {nearest.min():g}, expected a distance above 0, in the unit of the camera positions")
+    if (farthest <= nearest).any():
+        raise InputError(f"far: {farthest.min():g}, expected beyond near, which is {nearest.max():g}")
