@@ -1,0 +1,277 @@
+"""Gaussians in the .ply layout of 3D Gaussian splatting, which every viewer reads.
+
+One element `vertex`, binary little endian, float32: x y z, normals that mean nothing, SH band 0 as f_dc_*, the other
+bands as f_rest_* (all of red, then green, then blue), the opacity as its logit, the scales as their logarithms, the
+rotation as a wxyz quaternion. The frame is the scene's own, axes as OpenCV has them.
+"""
+
+import os
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import BinaryIO, NamedTuple, NoReturn
+
+import numpy as np
+
+from .errors import InputError
+from .files import replacing
+from .gaussians import Gaussians
+
+VERTICES_AT_ONCE = 1 << 13  # their rows stay in the cache while columns are filled one by one
+MIN_OPACITY = 1e-6  # a logit must be finite: opacities are kept this far from 0 and 1
+MIN_SCALE = 1e-30  # so must a logarithm
+MAX_HEADER_BYTES = 1 << 20
+MAGIC = b"ply"
+NUMBER_TYPES = {
+    "char": "<i1",
+    "int8": "<i1",
+    "uchar": "<u1",
+    "uint8": "<u1",
+    "short": "<i2",
+    "int16": "<i2",
+    "ushort": "<u2",
+    "uint16": "<u2",
+    "int": "<i4",
+    "int32": "<i4",
+    "uint": "<u4",
+    "uint32": "<u4",
+    "float": "<f4",
+    "float32": "<f4",
+    "double": "<f8",
+    "float64": "<f8",
+}
+LIST = "list"  # the type of a property whose length differs from row to row
+
+
+def write_ply(path: Path, gaussians: Gaussians) -> None:
+    """Write Gaussians, every SH band, as a binary .ply; the file appears whole or not at all.
+
+    Opacities are kept 1e-6 away from 0 and 1, so that their logit is finite. Raises InputError if a value is not
+    finite, a scale is negative, an opacity outside [0, 1], or the file cannot be written.
+    """
+    if (gaussians.scales < 0).any():
+        raise InputError(f"cannot write {path}: scales holds negative values; pass standard deviations, not logarithms")
+    if ((gaussians.opacities < 0) | (gaussians.opacities > 1)).any():
+        raise InputError(f"cannot write {path}: opacities holds values outside [0, 1]; pass opacities, not logits")
+    names = list(_columns(gaussians))
+    names[3:3] = ["nx", "ny", "nz"]  # gaussforge and some older viewers insist on normals
+    properties = "".join(f"property float {name}\n" for name in names)
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(gaussians)}\n{properties}end_header\n"
+    try:
+        with replacing(path) as temporary, temporary.open("wb") as file:
+            table = np.zeros((VERTICES_AT_ONCE, len(names)), "<f4")
+            _reserve(file, len(header) + len(gaussians) * table.itemsize * len(names))
+            file.write(header.encode("ascii"))
+            for block in _blocks(len(gaussians)):
+                rows = table[: block.stop - block.start]
+                _encode(gaussians, block, rows)
+                if not np.isfinite(rows).all():
+                    vertex, column = np.argwhere(~np.isfinite(rows))[0]
+                    raise InputError(
+                        f"cannot write {path}: {names[column]} of Gaussian {block.start + vertex} is not finite; "
+                        "leave that Gaussian out"
+                    )
+                file.write(rows.data)
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror}; choose a file on a disk with room for it") from None
+
+
+def read_ply(path: Path) -> Gaussians:
+    """Read a 3DGS .ply: properties in any order, float or double, with or without normals, others left alone.
+
+    Raises InputError if the file cannot be read, is not such a file, is cut short, or holds a value that is not finite.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            vertices = _find_vertices(file, path)
+            return _read_vertices(file, path, vertices)
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}; expected a splat file (.ply)") from None
+
+
+def _columns(gaussians: Gaussians) -> dict[str, np.ndarray]:
+    """A view of each column, [gaussians], under its name in the file and in the file's usual order."""
+    sh = gaussians.sh
+    rest = sh.shape[1] - 1
+    columns = {name: gaussians.means[:, axis] for axis, name in enumerate("xyz")}
+    columns |= {f"f_dc_{channel}": sh[:, 0, channel] for channel in range(3)}
+    columns |= {f"f_rest_{index}": sh[:, 1 + index % rest, index // rest] for index in range(3 * rest)}
+    columns["opacity"] = gaussians.opacities
+    columns |= {f"scale_{axis}": gaussians.scales[:, axis] for axis in range(3)}
+    columns |= {f"rot_{part}": gaussians.quats[:, part] for part in range(4)}
+    return columns
+
+
+def _blocks(count: int) -> Iterator[slice]:
+    """0 to count in steps that fit the cache."""
+    for start in range(0, count, VERTICES_AT_ONCE):
+        yield slice(start, min(start + VERTICES_AT_ONCE, count))
+
+
+def _reserve(file: BinaryIO, size: int) -> None:
+    """Claim the disk space at once where the system can: writing is three times faster than letting the file grow."""
+    if hasattr(os, "posix_fallocate"):
+        with suppress(OSError):  # not every file system can; a full disk shows again when it is written to
+            os.posix_fallocate(file.fileno(), 0, size)
+
+
+def _encode(gaussians: Gaussians, block: slice, rows: np.ndarray) -> None:
+    """Fill rows of the file with a block of the Gaussians: `_columns` in order, the normals after the means left alone.
+
+    Array by array, not column by column, which takes twice as long.
+    """
+    sh = gaussians.sh[block]
+    count, rest = len(sh), sh.shape[1] - 1
+    opacities = np.clip(gaussians.opacities[block], MIN_OPACITY, 1 - MIN_OPACITY)
+    rows[:, 0:3] = gaussians.means[block]
+    rows[:, 6:9] = sh[:, 0]
+    rows[:, 9:-8].reshape(count, 3, rest)[...] = sh[:, 1:].transpose(0, 2, 1)
+    rows[:, -8] = np.log(opacities / (1 - opacities))
+    rows[:, -7:-4] = np.log(np.maximum(gaussians.scales[block], MIN_SCALE))
+    rows[:, -4:] = gaussians.quats[block]
+
+
+class _Element(NamedTuple):
+    """One element of a .ply header."""
+
+    name: str
+    length: int
+    properties: dict[str, str]  # name -> NumPy type, or LIST
+
+
+class _Vertices(NamedTuple):
+    """Where the vertices lie in a file and what a row of them holds."""
+
+    offset: int
+    length: int
+    row: np.dtype
+    sh_coefficients: int
+
+
+def _read_vertices(file: BinaryIO, path: Path, vertices: _Vertices) -> Gaussians:
+    """The rows of a checked file, decoded."""
+    count = vertices.length
+    gaussians = Gaussians(
+        means=np.empty((count, 3), np.float32),
+        scales=np.empty((count, 3), np.float32),
+        quats=np.empty((count, 4), np.float32),
+        opacities=np.empty(count, np.float32),
+        sh=np.empty((count, vertices.sh_coefficients, 3), np.float32),
+    )
+    columns = _columns(gaussians)
+    file.seek(vertices.offset)
+    with np.errstate(over="ignore"):  # to infinity, which is refused below, or to an opacity of 0, which is meant
+        for block in _blocks(count):
+            rows = np.frombuffer(file.read((block.stop - block.start) * vertices.row.itemsize), vertices.row)
+            for name, column in columns.items():
+                column[block] = rows[name]
+            gaussians.scales[block] = np.exp(gaussians.scales[block])
+            gaussians.opacities[block] = 1 / (1 + np.exp(-gaussians.opacities[block]))
+            _check_finite(gaussians, block, path)
+    return gaussians
+
+
+def _check_finite(gaussians: Gaussians, block: slice, path: Path) -> None:
+    """Raise InputError for the first value of a block of decoded Gaussians that is not finite."""
+    arrays = (gaussians.means, gaussians.scales, gaussians.quats, gaussians.opacities, gaussians.sh)
+    if all(np.isfinite(array[block]).all() for array in arrays):
+        return
+    for name, column in _columns(gaussians).items():
+        for vertex in np.flatnonzero(~np.isfinite(column[block])):
+            raise InputError(
+                f"{path}: {name} of vertex {block.start + vertex} is not a finite number; remove that vertex"
+            )
+
+
+def _find_vertices(file: BinaryIO, path: Path) -> _Vertices:
+    """Check header and size of a file against what a splat file must have."""
+    offset = 0
+    elements, header_bytes = _read_header(file, path)
+    for element in elements:
+        if element.name == "vertex":
+            break
+        if LIST in element.properties.values():
+            _refuse(path, f"element {element.name} with lists stands before the vertices", "write the vertices first")
+        offset += element.length * np.dtype(list(element.properties.items())).itemsize
+    else:
+        _refuse(path, "the header has no element vertex", "give a 3D Gaussian splatting .ply")
+
+    sh_coefficients = _checked_properties(element, path)
+    row = np.dtype(list(element.properties.items()))
+    offset += header_bytes
+    expected, size = offset + element.length * row.itemsize, os.fstat(file.fileno()).st_size
+    if size < expected:
+        _refuse(
+            path,
+            f"cut short: {element.length} vertices need {expected} bytes, the file has {size}",
+            "copy or download it again",
+        )
+    return _Vertices(offset, element.length, row, sh_coefficients)
+
+
+def _checked_properties(vertex: _Element, path: Path) -> int:
+    """SH coefficients a channel of an element that has all that a Gaussian needs, as floating-point numbers."""
+    rest = sum(name.startswith("f_rest_") for name in vertex.properties)
+    coefficients = 1 + rest // 3
+    if rest not in (0, 9, 24, 45):
+        _refuse(
+            path,
+            f"{rest} properties f_rest_*",
+            "expected 0, 9, 24 or 45 (SH degree 0 to 3); write it with one of those",
+        )
+    sample = np.empty((0, coefficients, 3))
+    needed = _columns(Gaussians(sample[:, 0], sample[:, 0], np.empty((0, 4)), np.empty(0), sample))
+    missing = [name for name in needed if name not in vertex.properties]
+    if missing:
+        _refuse(
+            path,
+            f"element vertex has no property {', '.join(missing)}",
+            "give a 3D Gaussian splatting .ply, not a mesh, plain points or a compressed splat",
+        )
+    for name in needed:
+        if vertex.properties[name] not in ("<f4", "<f8"):
+            _refuse(path, f"property {name} is not float or double", "write it as float")
+    if LIST in vertex.properties.values():
+        _refuse(path, "element vertex has a list property", "write the file without it")
+    return coefficients
+
+
+def _read_header(file: BinaryIO, path: Path) -> tuple[list[_Element], int]:
+    """The elements that a .ply header announces, and the header's length in bytes."""
+    if file.readline(8).rstrip() != MAGIC:
+        _refuse(path, "not a .ply file (it does not begin with the line 'ply')", "give a 3D Gaussian splatting .ply")
+    elements: list[_Element] = []
+    has_format = False
+    while file.tell() < MAX_HEADER_BYTES:
+        line = file.readline(MAX_HEADER_BYTES)
+        if not line.endswith(b"\n"):
+            break
+        match line.decode("ascii", errors="replace").split():
+            case ["format", "binary_little_endian", "1.0"]:
+                has_format = True
+            case ["format", *form]:
+                _refuse(path, f"format {' '.join(form)}", "expected binary_little_endian 1.0; convert the file to that")
+            case ["element", name, count] if count.isascii() and count.isdigit() and len(count) < 19:
+                elements.append(_Element(name, int(count), {}))
+            case ["property", kind, name] if elements and kind in NUMBER_TYPES:
+                _add_property(elements[-1], name, NUMBER_TYPES[kind], path)
+            case ["property", "list", _, _, name] if elements:
+                _add_property(elements[-1], name, LIST, path)
+            case ["end_header"] if has_format:
+                return elements, file.tell()
+            case ["comment" | "obj_info", *_] | []:
+                pass
+            case words:
+                _refuse(path, f"header line '{' '.join(words)[:60]}' means nothing here", "write the file again")
+    _refuse(path, "the header has no end", "copy or download it again")
+
+
+def _add_property(element: _Element, name: str, number_type: str, path: Path) -> None:
+    if name in element.properties:
+        _refuse(path, f"element {element.name} has property {name} twice", "write it once")
+    element.properties[name] = number_type
+
+
+def _refuse(path: Path, what: str, remedy: str) -> NoReturn:
+    raise InputError(f"{path}: {what}; {remedy}")
