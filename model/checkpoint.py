@@ -1,0 +1,262 @@
+"""Strict loading of released checkpoints: every key and every shape, or an error that names what differs."""
+
+import pickle
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from .config import PRESETS, IDESplatConfig
+from .idesplat import IDESplat
+
+# Where a state dict may be nested in a file, and the prefix of the encoder's keys in it.
+CONTAINERS = ("state_dict", "model")
+PREFIX = "encoder."
+# Keys an error message shows before it only counts.
+SHOWN = 4
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that cannot be used; the message names the file, what is wrong and what to do."""
+
+
+def load_idesplat(path: Path, config: IDESplatConfig) -> IDESplat:
+    """Build the network and fill it from a file, `.ckpt`, `.pth`, `.pt` or `.safetensors`.
+
+    Raises CheckpointError if the file is unsafe or unreadable, or if any key or shape differs.
+    """
+    model = IDESplat(config)
+    fill(model, read_state_dict(path), path)
+    return model.eval()
+
+
+def read_state_dict(path: Path) -> dict[str, Tensor]:
+    """The encoder's tensors of a checkpoint file by their released names, without running code that the file may hold.
+
+    Raises CheckpointError.
+    """
+    if not path.is_file():
+        raise CheckpointError(
+            f"{path}: no such file; give the path of a released checkpoint (.ckpt, .pth or .safetensors)"
+        )
+    content = _read_safetensors(path) if path.suffix == ".safetensors" else _read_pickle(path)
+    for container in CONTAINERS:
+        if isinstance(content, dict) and isinstance(content.get(container), dict):
+            content = content[container]
+            break
+    if not isinstance(content, dict):
+        raise CheckpointError(f"{path}: holds a {type(content).__name__}, expected a state dict; is it a checkpoint?")
+    tensors = {key: value for key, value in content.items() if isinstance(value, Tensor)}
+    if any(key.startswith(PREFIX) for key in tensors):  # other prefixes belong to the loss and are not ours
+        tensors = {key.removeprefix(PREFIX): value for key, value in tensors.items() if key.startswith(PREFIX)}
+    if not tensors:
+        raise CheckpointError(f"{path}: holds no tensors, expected a state dict; is it a checkpoint?")
+    return tensors
+
+
+def _read_safetensors(path: Path) -> object:
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    try:
+        return load_file(path)
+    except (SafetensorError, OSError, ValueError) as error:
+        raise CheckpointError(f"{path}: not a readable safetensors file ({error}); download it again") from None
+
+
+def _read_pickle(path: Path) -> object:
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        wanted = re.search(r"GLOBAL ([\w.]+)", str(error))
+        what = f"wants to run {wanted[1]}" if wanted else "is not a plain state dict"
+        raise CheckpointError(
+            f"{path}: {what}; only tensors and plain containers are loaded, because a pickle can run any code. "
+            "Save the state dict alone, or as .safetensors, on a machine where you trust the file"
+        ) from None
+    except (RuntimeError, EOFError, OSError, ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise CheckpointError(f"{path}: not a readable checkpoint ({reason}); download it again") from None
+
+
+def fitting_presets(tensors: dict[str, Tensor]) -> list[str]:
+    """Names of the presets whose keys and shapes are exactly the file's."""
+    renamed = rename_released(tensors)
+    return [name for name, config in PRESETS.items() if not _differences(_expected_shapes(config), renamed)]
+
+
+def infer_preset(path: Path, tensors: dict[str, Tensor]) -> str:
+    """The preset of a checkpoint: the one that its tensors fit and, among several, that its name names.
+
+    Raises CheckpointError if no preset fits, or several do and the name does not decide.
+    """
+    fitting = fitting_presets(tensors)
+    named = [name for name in fitting if name.rsplit("-", 1)[-1] in path.name.lower()]
+    if len(named or fitting) == 1:
+        return (named or fitting)[0]
+    if not fitting:
+        closest = min(
+            PRESETS, key=lambda name: len(_differences(_expected_shapes(PRESETS[name]), rename_released(tensors)))
+        )
+        different = _differences(_expected_shapes(PRESETS[closest]), rename_released(tensors))
+        raise CheckpointError(
+            f"{path}: fits none of the presets {', '.join(PRESETS)}; from {closest} it differs in {_shown(different)}"
+        )
+    raise CheckpointError(
+        f"{path}: fits the presets {', '.join(fitting)}, and its name does not say which; choose with --preset"
+    )
+
+
+def fill(model: IDESplat, tensors: dict[str, Tensor], path: Path) -> None:
+    """Load released tensors into a model; raises CheckpointError naming the first keys that differ."""
+    renamed = rename_released(tensors)
+    own = model.state_dict()
+    different = _differences({key: tuple(value.shape) for key, value in own.items()}, renamed)
+    if different:
+        raise CheckpointError(
+            f"{path}: does not fit the network: {_shown(different)}; choose the preset it was trained with"
+        )
+    model.load_state_dict({key: value.reshape(own[key].shape) for key, value in renamed.items()})
+
+
+def _expected_shapes(config: IDESplatConfig) -> dict[str, tuple[int, ...]]:
+    with torch.device("meta"):
+        return {key: tuple(value.shape) for key, value in IDESplat(config).state_dict().items()}
+
+
+def _differences(expected: dict[str, tuple[int, ...]], tensors: dict[str, Tensor]) -> list[str]:
+    """What differs, in words: missing keys, keys unknown, shapes."""
+    missing = [f"{key} is missing" for key in expected if key not in tensors]
+    unknown = [f"{key} is unknown" for key in tensors if key not in expected]
+    shapes = [
+        f"{key} has shape {tuple(tensors[key].shape)} instead of {shape}"
+        for key, shape in expected.items()
+        if key in tensors and tuple(tensors[key].squeeze().shape) != tuple(size for size in shape if size != 1)
+    ]
+    return missing + shapes + unknown
+
+
+def _shown(differences: list[str]) -> str:
+    more = f" and {len(differences) - SHOWN} more" if len(differences) > SHOWN else ""
+    return ", ".join(differences[:SHOWN]) + more
+
+
+def rename_released(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Tensors by this project's names; those that no network uses are left out, other unknown keys keep their name."""
+    return {rename_key(key): value for key, value in tensors.items() if not UNUSED.search(key)}
+
+
+def rename_key(key: str) -> str:
+    """A released key by this project's name."""
+    for pattern, replacement in RENAMES:
+        key = pattern.sub(replacement, key)
+    return key
+
+
+# Weights that the releases carry and never use: the ViT's mask token, the coarsest fusion's lateral unit, a second
+# projection in the focused layers; and an index that follows from the window size.
+UNUSED = re.compile(
+    r"pretrained\.mask_token$|refinenet4\.resConfUnit1\.|gaussian_layers\.\d+\.proj\.|relative_position_index_SA$"
+)
+
+
+def _unet_input(match: re.Match[str]) -> str:
+    """U-Net blocks on the way down alternate: 0 the first convolution, odd ones a level, even ones a downsampling."""
+    block, part = int(match[1]), match[2]
+    if block == 0:
+        return "conv_in."
+    if block % 2 == 0:
+        return f"downsamples.{block // 2 - 1}."
+    return f"down_blocks.{block // 2}." if part == "0" else "down_attention."
+
+
+def _unet_output(match: re.Match[str]) -> str:
+    """U-Net blocks on the way up come in pairs; the second of a pair may end with an upsampling."""
+    block, rest = int(match[1]), match[2]
+    if rest == "0.":
+        return f"up_blocks.{block}."
+    return f"upsamples.{block // 2}." if rest.endswith("conv.") else f"up_attention.{block}."
+
+
+def _counted_down(name: str) -> Callable[[re.Match[str]], str]:
+    """Numbering from one -> from zero."""
+    return lambda match: f"{name}.{int(match[1]) - 1}."
+
+
+RENAMES: list[tuple[re.Pattern[str], str | Callable[[re.Match[str]], str]]] = [
+    (re.compile(pattern), replacement)
+    for pattern, replacement in [
+        # stages
+        (r"^depth_predictor\.(backbone|transformer)\.", r"encoder.\1."),
+        (r"^depth_predictor\.depth_anything\.pretrained\.", "encoder.vit."),
+        (r"^depth_predictor\.depth_anything\.depth_head\.", "encoder.dpt."),
+        (r"^depth_predictor\.conv_mv\.", "dpbu1.merge.conv."),
+        (r"^depth_predictor\.conv_mv_u2\.", "dpbu2.merge.conv."),
+        (r"^depth_predictor\.conv_mv_u4\.", "dpbu3.merge.conv."),
+        (r"^depth_predictor\.cvo_pyramid_u2\.stages\.0\.", "dpbu2.grow_features."),
+        (r"^depth_predictor\.mv_pyramid_u2\.stages\.0\.", "dpbu2.grow_context."),
+        (r"^depth_predictor\.cvo_pyramid_u4\.stages\.0\.", "dpbu3.grow_features."),
+        (r"^depth_predictor\.mv_pyramid_u4\.stages\.0\.", "dpbu3.grow_context."),
+        (r"^depth_predictor\.features_cnn_u2\.stages\.0\.", "dpbu3.grow_cnn."),
+        (r"^depth_predictor\.wiea_f(\d)_1\.", r"dpbu\1.first."),
+        (r"^depth_predictor\.wiea_f(\d)_2\.", r"dpbu\1.second."),
+        (r"^depth_predictor\.res_depth_head\.", "gaussians.residual."),
+        (r"^depth_predictor\.conv_image\.", "gaussians.conv_image."),
+        (r"^depth_predictor\.gaussian_fuse\.", "gaussians.fuse."),
+        (r"^depth_predictor\.gaussian_layers\.", "gaussians.focus.layers."),
+        (r"^depth_predictor\.gaussian_conv\.", "gaussians.expand."),
+        (r"^gaussian_head\.0\.", "gaussians.head1."),
+        (r"^gaussian_head\.2\.", "gaussians.head2."),
+        # backbone and multi-view transformer
+        (r"\.downsample\.0\.", ".shortcut."),
+        (r"\.cross_attn_ffn\.mlp\.0\.", ".mlp1."),
+        (r"\.cross_attn_ffn\.mlp\.2\.", ".mlp2."),
+        (r"\.cross_attn_ffn\.norm2\.", ".norm."),
+        (r"\.(self_attn|cross_attn)(?:_ffn)?\.norm1\.", r".\1.norm."),
+        (r"\.cross_attn_ffn\.", ".cross_attn."),
+        # ViT and DPT head
+        (r"\.patch_embed\.proj\.", ".patch_embed."),
+        (r"\.ls([12])\.gamma$", r".scale\1"),
+        (r"\.mlp\.fc([12])\.", r".fc\1."),
+        (r"\.resize_layers\.0\.", ".grow4."),
+        (r"\.resize_layers\.1\.", ".grow2."),
+        (r"\.resize_layers\.3\.", ".shrink2."),
+        (r"scratch\.layer(\d)_rn\.", _counted_down("laterals")),
+        (r"scratch\.refinenet(\d)\.", _counted_down("fusions")),
+        (r"\.resConfUnit1\.", ".lateral."),
+        (r"\.resConfUnit2\.", ".unit."),
+        (r"scratch\.output_conv1\.", "disparity1."),
+        (r"scratch\.output_conv2\.0\.", "disparity2."),
+        (r"scratch\.output_conv2\.2\.", "disparity3."),
+        # epipolar attention and the focused module
+        (r"\.k_pe$", ".key_position"),
+        (r"\.v_pe$", ".value_position"),
+        (r"\.rpe$", ".score_position"),
+        (r"\.mv_norm([12])\.", r".norm\1."),
+        (r"\.(?:w_)?W([qkv])\.", r".\1_proj."),
+        (r"\.convffn\.", ".ffn."),
+        (r"\.dwconv\.depthwise_conv\.0\.", ".depthwise.conv."),
+        (r"\.v_LePE\.depthwise_conv\.0\.", ".v_depthwise.conv."),
+        (r"\.attn_win\.relative_position_bias_table$", ".position_bias"),
+        (r"\.attn_win\.proj\.", ".proj."),
+        # U-Nets
+        (r"\.Sim_UNet\.", ".regulariser."),
+        (r"(residual|regulariser)\.0\.", r"\1.conv_in."),
+        (r"(residual|regulariser)\.1\.", r"\1.norm_in."),
+        (r"(residual|regulariser)\.3\.", r"\1.unet."),
+        (r"(residual|regulariser)\.4\.", r"\1.conv_out."),
+        (r"input_blocks\.(\d+)\.(\d)\.(?:op\.)?", _unet_input),
+        (r"output_blocks\.(\d+)\.(\d\.(?:conv\.)?)", _unet_output),
+        (r"middle_block\.0\.", "middle.0."),
+        (r"middle_block\.2\.", "middle.1."),
+        (r"unet\.out\.0\.", "unet.norm_out."),
+        (r"unet\.out\.2\.", "unet.conv_out."),
+        (r"\.in_layers\.0\.", ".norm1."),
+        (r"\.in_layers\.2\.", ".conv1."),
+        (r"\.out_layers\.0\.", ".norm2."),
+        (r"\.out_layers\.3\.", ".conv2."),
+        (r"\.skip_connection\.", ".shortcut."),
+    ]
+]

@@ -1,0 +1,133 @@
+"""A depth probability boosting unit: two epipolar attention layers whose probabilities multiply (IDESplat, section 2).
+
+Three of them run from coarse to fine, each in a narrower range around the inverse depth of the one before.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from .config import DPBUConfig, IDESplatConfig
+from .encoder import Encoded
+from .epipolar_attention import EpipolarAttention
+from .geometry import nearest_pixels, nearest_views, scale_intrinsics
+from .layers import Merge, Upsample2x, resize
+
+
+class Cameras(NamedTuple):
+    """What the geometry needs of the views."""
+
+    extrinsics: Tensor  # [views, 4, 4] camera-to-world, OpenCV axes
+    intrinsics: Tensor  # [views, 3, 3] normalised by width and height
+    near: Tensor  # [views]
+    far: Tensor  # [views]
+
+
+class Boosted(NamedTuple):
+    """What a unit hands to the next."""
+
+    features: Tensor  # [views, channels, h, w] after the attention
+    context: Tensor  # [views, context channels, h, w] before it, refined along from unit to unit
+    cnn: Tensor  # [views, cnn channels, h, w]
+    inverse_depth_first: Tensor  # [views, 1, h, w] after the first layer alone
+    inverse_depth: Tensor  # [views, 1, h, w]
+    probability: Tensor  # [views, candidates, h, w], mean over the neighbours
+    candidates: Tensor  # [views, candidates, h, w] inverse depths
+
+
+class DepthProbabilityBoostingUnit(nn.Module):
+    """The part that all three units share."""
+
+    def __init__(self, config: IDESplatConfig, unit: DPBUConfig) -> None:
+        super().__init__()
+        self.neighbours = config.neighbours
+        self.first = EpipolarAttention(unit, config.ffn_ratio, config.ffn_kernel)
+        self.second = EpipolarAttention(unit, config.ffn_ratio, config.ffn_kernel)
+
+    def boost(
+        self, features: Tensor, seed: Tensor, candidates: Tensor, cameras: Cameras
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Two layers over the same warp indices -> features, inverse depth of the first, of both, probability."""
+        views, _, height, width = features.shape
+        neighbours = nearest_views(cameras.extrinsics, self.neighbours)
+        pixels = scale_intrinsics(cameras.intrinsics, height, width)
+        rows = nearest_pixels(candidates, pixels, cameras.extrinsics, neighbours)
+        features, prior = self.first(features, seed, rows, None)
+        first_depth, _ = expectation(prior, candidates)
+        features, posterior = self.second(features, first_depth, rows, prior)
+        inverse_depth, probability = expectation(posterior, candidates)
+        return features, first_depth, inverse_depth, probability
+
+
+class CoarseUnit(DepthProbabilityBoostingUnit):
+    """The first unit: it searches the whole range, and starts from the encoder's features and monocular disparity."""
+
+    def __init__(self, config: IDESplatConfig, unit: DPBUConfig) -> None:
+        super().__init__(config, unit)
+        self.candidates = unit.candidates
+        parts = (config.feature_channels, config.feature_channels, config.vit.dim, config.dpt.features)
+        self.merge = Merge(parts, unit.channels)
+
+    def forward(self, encoded: Encoded, cameras: Cameras) -> Boosted:
+        """Encoded views -> features and inverse depth at the encoder's resolution."""
+        size = encoded.features_cnn.shape[2:]
+        at_size = [encoded.features_cnn, encoded.features_mv, encoded.features_mono]
+        context = self.merge(at_size, [encoded.mono_out], *size)
+        nearest, farthest = _per_view(1 / cameras.near), _per_view(1 / cameras.far)
+        steps = torch.linspace(0, 1, self.candidates, dtype=context.dtype, device=context.device)[None, :, None, None]
+        candidates = (farthest + steps * (nearest - farthest)).expand(-1, -1, *size)
+        features, first, inverse_depth, probability = self.boost(context, encoded.mono_disparity, candidates, cameras)
+        return Boosted(features, context, encoded.features_cnn_fine, first, inverse_depth, probability, candidates)
+
+
+class FinerUnit(DepthProbabilityBoostingUnit):
+    """The second or third unit: twice the resolution, candidates around the inverse depth of the unit before."""
+
+    def __init__(self, config: IDESplatConfig, unit: DPBUConfig, before: DPBUConfig, context: int, cnn: int) -> None:
+        """`before` is the previous unit; `context` and `cnn` are the channels that come from it."""
+        super().__init__(config, unit)
+        self.candidates = unit.candidates
+        # The coarse unit's intervals, and by how much this unit's are narrower.
+        self.intervals = (config.dpbus[0].candidates - 1) * unit.scale
+        self.grow_features = Upsample2x(before.channels)
+        self.grow_context = Upsample2x(context)
+        # The CNN has a map of the second unit's resolution itself; only the third must grow it.
+        self.grow_cnn = Upsample2x(cnn) if unit.scale > 2 else nn.Identity()
+        cnn = cnn // 2 if unit.scale > 2 else cnn
+        self.merge = Merge(
+            (before.channels // 2, context // 2, cnn, config.vit.dim, config.dpt.features), unit.channels
+        )
+
+    def forward(self, encoded: Encoded, before: Boosted, cameras: Cameras) -> Boosted:
+        """Encoded views and the unit before -> features and inverse depth at twice its resolution."""
+        context = self.grow_context(before.context)
+        cnn = self.grow_cnn(before.cnn)
+        size = context.shape[2:]
+        at_size = [self.grow_features(before.features), context, cnn]
+        features = self.merge(at_size, [encoded.features_mono, encoded.mono_out], *size)
+        seed = resize(before.inverse_depth, *size)
+        candidates = self.candidates_around(seed, cameras)
+        features, first, inverse_depth, probability = self.boost(features, seed, candidates, cameras)
+        return Boosted(features, context, cnn, first, inverse_depth, probability, candidates)
+
+    def candidates_around(self, seed: Tensor, cameras: Cameras) -> Tensor:
+        """Candidates [views, candidates, h, w], evenly spaced around the seed within the cameras' range."""
+        nearest, farthest = _per_view(1 / cameras.near), _per_view(1 / cameras.far)
+        half = (self.candidates - 1) / 2
+        reach = (nearest - farthest) / self.intervals * half
+        low = torch.maximum(seed - reach, farthest)
+        high = torch.minimum(seed + reach, nearest)
+        steps = torch.linspace(-half, half, self.candidates, dtype=seed.dtype, device=seed.device)[None, :, None, None]
+        return (low + high) / 2 + steps * ((high - low) / (self.candidates - 1))
+
+
+def expectation(probability: Tensor, candidates: Tensor) -> tuple[Tensor, Tensor]:
+    """Probabilities [pairs, candidates, h * w] -> expected inverse depth [views, 1, h, w], probability [views, candidates, h, w]."""
+    views, _, height, width = candidates.shape
+    probability = probability.unflatten(0, (views, -1)).mean(1).unflatten(2, (height, width))
+    return (probability * candidates).sum(1, keepdim=True), probability
+
+
+def _per_view(x: Tensor) -> Tensor:
+    return x[:, None, None, None]

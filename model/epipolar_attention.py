@@ -1,0 +1,93 @@
+"""One warp-index epipolar attention layer: each pixel attends to the pixels its depth candidates fall on in other views.
+
+The releases multiply sparsely in a CUDA extension; here the same sums run over integer gathers of feature rows.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from .config import DPBUConfig
+from .layers import ConvFFN, to_map, to_tokens
+from .unet import CostRegulariser
+
+# Candidates gathered at once: it bounds the memory to this many copies of the features.
+CHUNK = 4
+# Keeps the renormalised product of probabilities away from zero.
+EPSILON = 1e-10
+
+
+class EpipolarAttention(nn.Module):
+    """Warp-index epipolar attention (IDESplat, section 2)."""
+
+    def __init__(self, config: DPBUConfig, ffn_ratio: int, ffn_kernel: int) -> None:
+        super().__init__()
+        channels, candidates = config.channels, config.candidates
+        self.scale = channels**-0.5
+        # Position embeddings of the candidates, for keys, values and scores.
+        self.key_position = nn.Parameter(torch.zeros(candidates))
+        self.value_position = nn.Parameter(torch.zeros(candidates))
+        self.score_position = nn.Parameter(torch.zeros(candidates))
+        for position in (self.key_position, self.value_position, self.score_position):
+            nn.init.trunc_normal_(position, std=0.02)
+        self.norm1 = nn.LayerNorm(channels)
+        self.q_proj = nn.Linear(channels, channels)
+        self.k_proj = nn.Linear(channels, channels)
+        self.v_proj = nn.Linear(channels, channels)
+        self.regulariser = CostRegulariser(candidates + 1, candidates, config.unet)
+        self.proj = nn.Linear(channels, channels)
+        self.norm2 = nn.LayerNorm(channels)
+        self.ffn = ConvFFN(channels, ffn_ratio, ffn_kernel)
+
+    def forward(self, features: Tensor, seed: Tensor, rows: Tensor, prior: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Attend along the epipolar lines.
+
+        features: [views, channels, h, w]; seed: what is known of the inverse depth, [views, 1, h, w].
+        rows: warp indices [pairs, candidates, h * w], pairs = views * neighbours (geometry.nearest_pixels).
+        prior: the previous layer's probabilities [pairs, candidates, h * w], which this layer's multiply.
+        Returns features of the same shape and the probabilities.
+        """
+        views, _, height, width = features.shape
+        neighbours = rows.shape[0] // views
+        tokens = to_tokens(features)
+        normed = self.norm1(tokens)
+        queries = repeat_views(self.q_proj(normed) * self.scale, neighbours)
+        scores = correlate(queries, pixel_table(self.k_proj(normed)), rows)  # [pairs, candidates, h * w]
+        scores = scores + queries.sum(-1)[:, None] * self.key_position[:, None] + self.score_position[:, None]
+
+        known = torch.cat([repeat_views(seed, neighbours), scores.unflatten(2, (height, width))], dim=1)
+        probability = self.regulariser(known, views).flatten(2)
+        if prior is not None:  # depth probability boosting
+            product = probability * prior
+            probability = (product + EPSILON) / (product.sum(1, keepdim=True) + EPSILON)
+
+        gathered = weigh(probability, pixel_table(self.v_proj(normed)), rows)  # [pairs, h * w, channels]
+        gathered = gathered + (probability * self.value_position[:, None]).sum(1)[..., None]
+        tokens = tokens + self.proj(gathered.unflatten(0, (views, neighbours)).mean(1))
+        tokens = tokens + self.ffn(self.norm2(tokens), height, width)
+        return to_map(tokens, height, width), probability
+
+
+def repeat_views(x: Tensor, neighbours: int) -> Tensor:
+    """Each view's entry once for each of its neighbours: [views, ...] -> [views * neighbours, ...]."""
+    return x[:, None].expand(-1, neighbours, *x.shape[1:]).flatten(0, 1)
+
+
+def pixel_table(tokens: Tensor) -> Tensor:
+    """All views' pixels as rows, and a last row of zeros for what lies outside: [views * h * w + 1, channels]."""
+    rows = tokens.flatten(0, 1)
+    return torch.cat([rows, torch.zeros_like(rows[:1])])
+
+
+def correlate(queries: Tensor, table: Tensor, rows: Tensor) -> Tensor:
+    """Inner products of queries [pairs, h * w, channels] with the table's rows: [pairs, candidates, h * w]."""
+    scores = [
+        (table[chunk] * queries[:, None]).sum(-1)  # [pairs, chunk, h * w]
+        for chunk in rows.split(CHUNK, dim=1)
+    ]
+    return torch.cat(scores, dim=1)
+
+
+def weigh(probability: Tensor, table: Tensor, rows: Tensor) -> Tensor:
+    """The table's rows [pairs, candidates, h * w] summed with the probabilities as weights: [pairs, h * w, channels]."""
+    chunks = zip(probability.split(CHUNK, dim=1), rows.split(CHUNK, dim=1), strict=True)
+    return sum((weight[..., None] * table[chunk]).sum(1) for weight, chunk in chunks)

@@ -1,0 +1,91 @@
+"""The last stage: depth refined once more and fused, and each pixel's raw Gaussian parameters and Gaussian."""
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from .config import IDESplatConfig
+from .dpbu import Boosted, Cameras
+from .encoder import Encoded, normalise
+from .gaussian_adapter import GaussianAdapter, WorldGaussians
+from .gaussian_focus import GaussianFocusedModule
+from .layers import resize
+from .unet import CostRegulariser
+
+# Shares of the three units' and the residual head's inverse depth in the final one (mv_unimatch.py).
+DEPTH_SHARES = (0.1, 0.1, 0.4, 0.4)
+# Pixels of a block that become channels, a side.
+SHUFFLE = 4
+# Opacity logit, offset within the pixel (2), scales (3), quaternion (4); the spherical harmonics come on top.
+BASE_PARAMETERS = 10
+# conv_image's channels are the feature channels over this.
+IMAGE_SHARE = 16
+
+
+class Predicted(NamedTuple):
+    """The network's result, and the two maps before it that parity looks at."""
+
+    depth: Tensor  # [views, H, W], metric z-depth
+    gaussians: WorldGaussians
+    features: Tensor  # [views, feature channels, H, W]
+    raw: Tensor  # [views, parameters, H, W]
+
+
+class GaussianStage(nn.Module):
+    """Residual depth head, depth fusion, Gaussian focused module, Gaussian head and adapter."""
+
+    def __init__(self, config: IDESplatConfig) -> None:
+        super().__init__()
+        last, channels = config.dpbus[2], config.feature_channels
+        self.residual = CostRegulariser(last.channels + last.candidates + 1, last.candidates, config.residual_unet)
+        block = SHUFFLE**2
+        image_channels = channels // IMAGE_SHARE
+        fused = (image_channels + last.channels + 1) * block + channels + config.dpbus[0].channels
+        self.conv_image = nn.Conv2d(3, image_channels, 1)
+        self.fuse = nn.Conv2d(fused, config.focus.channels, 1)
+        self.focus = GaussianFocusedModule(config.focus, config.ffn_ratio, config.ffn_kernel)
+        self.expand = nn.Conv2d(config.focus.channels, block * channels, 1)
+        parameters = BASE_PARAMETERS + 3 * config.sh_coefficients
+        self.head1 = nn.Conv2d(channels, parameters, 3, padding=1, padding_mode="replicate")
+        self.head2 = nn.Conv2d(parameters, parameters, 3, padding=1, padding_mode="replicate")
+        self.adapter = GaussianAdapter(config.sh_degree, config.scale_min, config.scale_max)
+
+    def forward(
+        self, images: Tensor, cameras: Cameras, encoded: Encoded, units: tuple[Boosted, Boosted, Boosted]
+    ) -> Predicted:
+        """Images [views, 3, H, W] in [0, 1] and all that is known of them -> depth and Gaussians."""
+        inverse_depth = self.fused_inverse_depth(units, cameras, *images.shape[2:])
+        features = self.pixel_features(normalise(images), inverse_depth, encoded, units)
+        raw = self.head2(F.gelu(self.head1(features)))
+        depth = 1 / inverse_depth[:, 0]
+        return Predicted(depth, self.adapter(raw, depth, images, cameras), features, raw)
+
+    def fused_inverse_depth(
+        self, units: tuple[Boosted, Boosted, Boosted], cameras: Cameras, height: int, width: int
+    ) -> Tensor:
+        """The shares of the units and of the residual head, within the cameras' range: [views, 1, height, width]."""
+        last = units[2]
+        known = torch.cat([last.features, last.probability, last.inverse_depth], dim=1)
+        probability = self.residual(known, last.features.shape[0])
+        residual = (probability * last.candidates).sum(1, keepdim=True)
+        maps = [*(unit.inverse_depth for unit in units), residual]
+        fused = sum(share * resize(x, height, width) for share, x in zip(DEPTH_SHARES, maps, strict=True))
+        near, far = (x[:, None, None, None] for x in (cameras.near, cameras.far))
+        return torch.minimum(torch.maximum(fused, 1 / far), 1 / near)
+
+    def pixel_features(
+        self, images: Tensor, inverse_depth: Tensor, encoded: Encoded, units: tuple[Boosted, Boosted, Boosted]
+    ) -> Tensor:
+        """What the Gaussian head reads of each pixel, [views, feature channels, H, W]."""
+        size, full_size = encoded.features_cnn.shape[2:], images.shape[2:]
+        parts = [
+            resize(F.pixel_unshuffle(self.conv_image(images), SHUFFLE), *size),
+            encoded.features_cnn,
+            units[0].context,
+            F.pixel_unshuffle(units[2].features, SHUFFLE),
+            resize(F.pixel_unshuffle(inverse_depth, SHUFFLE), *size),
+        ]
+        focused = self.focus(self.fuse(torch.cat(parts, dim=1)))
+        return resize(F.pixel_shuffle(self.expand(focused), SHUFFLE), *full_size)

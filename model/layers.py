@@ -1,0 +1,87 @@
+"""Small layers that several parts share."""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+GROUPS = 8
+
+
+def resize(x: Tensor, height: int, width: int) -> Tensor:
+    """Resize maps [n, channels, h, w] bilinearly with aligned corners, as all of the releases' resizing is done."""
+    return F.interpolate(x, (height, width), mode="bilinear", align_corners=True)
+
+
+def softmax(x: Tensor, dim: int) -> Tensor:
+    """Softmax spelt out, since ONNX Runtime's CPU kernel is ten times slower along any axis but the last."""
+    exponentials = (x - x.amax(dim, keepdim=True)).exp()
+    return exponentials / exponentials.sum(dim, keepdim=True)
+
+
+def to_tokens(x: Tensor) -> Tensor:
+    """[n, channels, h, w] -> [n, h * w, channels]."""
+    return x.flatten(2).transpose(1, 2)
+
+
+def to_map(tokens: Tensor, height: int, width: int) -> Tensor:
+    """[n, h * w, channels] -> [n, channels, h, w]."""
+    return tokens.transpose(1, 2).unflatten(2, (height, width))
+
+
+class Upsample2x(nn.Sequential):
+    """Twice the resolution, half the channels (the releases' vit_fpn.py at scale 2)."""
+
+    def __init__(self, channels: int) -> None:
+        half = channels // 2
+        super().__init__(
+            nn.ConvTranspose2d(channels, half, 2, stride=2), nn.GELU(), nn.Conv2d(half, half, 3, padding=1)
+        )
+
+
+class Merge(nn.Module):
+    """A 1x1 convolution over the concatenation of maps of any resolution, each resized to the asked size.
+
+    A 1x1 convolution and a bilinear resize commute, so each part is convolved at its own, often much lower,
+    resolution and channel count before it grows.
+    """
+
+    def __init__(self, in_channels: tuple[int, ...], out_channels: int) -> None:
+        super().__init__()
+        self.in_channels = in_channels
+        self.conv = nn.Conv2d(sum(in_channels), out_channels, 1)
+
+    def forward(self, at_size: list[Tensor], to_resize: list[Tensor], height: int, width: int) -> Tensor:
+        """Merge maps that already have the size and maps that do not; in this order they fill `in_channels`."""
+        weights = self.conv.weight.split(self.in_channels, dim=1)
+        whole = torch.cat(at_size, dim=1)
+        merged = F.conv2d(whole, torch.cat(weights[: len(at_size)], dim=1), self.conv.bias)
+        for part, weight in zip(to_resize, weights[len(at_size) :], strict=True):
+            merged = merged + resize(F.conv2d(part, weight), height, width)
+        return merged
+
+
+class DepthwiseConv(nn.Module):
+    """A depthwise convolution and GELU on tokens laid out as an image."""
+
+    def __init__(self, channels: int, kernel: int) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(channels, channels, kernel, padding=kernel // 2, groups=channels)
+
+    def forward(self, tokens: Tensor, height: int, width: int) -> Tensor:
+        """[n, h * w, channels] -> the same shape."""
+        return to_tokens(F.gelu(self.conv(to_map(tokens, height, width))))
+
+
+class ConvFFN(nn.Module):
+    """The feed-forward layer after epipolar and window attention: it also looks at a pixel's neighbours."""
+
+    def __init__(self, channels: int, ratio: int, kernel: int) -> None:
+        super().__init__()
+        self.fc1 = nn.Linear(channels, channels * ratio)
+        self.depthwise = DepthwiseConv(channels * ratio, kernel)
+        self.fc2 = nn.Linear(channels * ratio, channels)
+
+    def forward(self, tokens: Tensor, height: int, width: int) -> Tensor:
+        """[n, h * w, channels] -> the same shape."""
+        hidden = F.gelu(self.fc1(tokens))
+        return self.fc2(hidden + self.depthwise(hidden, height, width))
