@@ -1,0 +1,271 @@
+"""A differentiable rasteriser of Gaussians for training, on the CPU: gsplat's semantics, gradients to every input.
+
+Projection and spherical harmonics are plain torch. Compositing is compiled: the splats are visited front to back, each
+adds to the pixels of its box, and the way back visits them in the opposite order. Nothing is kept per fragment.
+"""
+
+import functools
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor
+
+NEAR = 0.01  # scene units
+BLUR = 0.3  # pixels^2 added to the projected covariance
+FIELD_SLACK = 0.3  # of half the field of view: how far outside of it the projection is linearised as at its rim
+MAX_ALPHA = 0.99
+MIN_ALPHA = 1 / 255
+MIN_TRANSMITTANCE = 1e-4
+
+_compiled = functools.partial(
+    numba.njit, cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"}
+)
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    sh: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    background: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Render Gaussians; returns rgb [height, width, 3], alpha and depth [height, width].
+
+    means: world units, [gaussians, 3]. quats: wxyz, of any length but zero, [gaussians, 4]. scales: world units,
+    [gaussians, 3]. opacities: in [0, 1], [gaussians]. sh: degree 0 to 3, [gaussians, (degree + 1)^2, 3].
+    viewmat: world-to-camera, OpenCV axes, [4, 4]. K: pixels, pixel centres at .5, [3, 3]. background: [3].
+    depth is the z-depth weighted as colour is, and not divided by alpha. All in one float type, on the CPU.
+    """
+    camera_means = means @ viewmat[:3, :3].T + viewmat[:3, 3]
+    seen = torch.nonzero(camera_means.detach()[:, 2] > NEAR)[:, 0]
+    if len(seen) < len(means):
+        camera_means, means, quats = camera_means[seen], means[seen], quats[seen]
+        scales, opacities, sh = scales[seen], opacities[seen], sh[seen]
+    centres, conics = _project(camera_means, quats, scales, viewmat, K, width, height)
+    colours = _colours(sh, means, -viewmat[:3, :3].T @ viewmat[:3, 3])
+    values = torch.cat([colours, camera_means[:, 2:]], dim=-1)  # [gaussians, 4]
+    image, transmittance = _Composite.apply(centres, conics, opacities, values, width, height)
+    return image[..., :3] + transmittance[..., None] * background, 1 - transmittance, image[..., 3]
+
+
+def _project(
+    camera_means: Tensor,  # [gaussians, 3]
+    quats: Tensor,
+    scales: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+) -> tuple[Tensor, Tensor]:
+    """The splats' centres in pixels [gaussians, 2] and inverse covariances (xx, xy, yy) [gaussians, 3]."""
+    x, y, z = camera_means.unbind(-1)
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    centres = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
+    slack_x, slack_y = FIELD_SLACK * 0.5 * width / fx, FIELD_SLACK * 0.5 * height / fy
+    slope_x = torch.clamp(x / z, -cx / fx - slack_x, (width - cx) / fx + slack_x)
+    slope_y = torch.clamp(y / z, -cy / fy - slack_y, (height - cy) / fy + slack_y)
+    rotation = viewmat[:3, :3]
+    # The projection's Jacobian times the camera's rotation, row by row, [gaussians, 3].
+    row_u = (fx / z)[:, None] * (rotation[0] - slope_x[:, None] * rotation[2])
+    row_v = (fy / z)[:, None] * (rotation[1] - slope_y[:, None] * rotation[2])
+    axes = _scaled_axes(quats, scales)  # [gaussians, 3, 3]
+    half_u = (row_u[:, :, None] * axes).sum(dim=1)  # [gaussians, 3]
+    half_v = (row_v[:, :, None] * axes).sum(dim=1)
+    xx = (half_u * half_u).sum(dim=-1) + BLUR
+    xy = (half_u * half_v).sum(dim=-1)
+    yy = (half_v * half_v).sum(dim=-1) + BLUR
+    determinant = xx * yy - xy * xy
+    return centres, torch.stack([yy, -xy, xx], dim=-1) / determinant[:, None]
+
+
+def _scaled_axes(quats: Tensor, scales: Tensor) -> Tensor:
+    """The Gaussians' axes in the world as columns, each as long as its scale, [gaussians, 3, 3]."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    rotation = torch.stack(
+        [
+            *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+            *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+            *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+        ],
+        dim=-1,
+    )
+    return rotation.view(-1, 3, 3) * scales[:, None, :]
+
+
+def _colours(sh: Tensor, means: Tensor, camera: Tensor) -> Tensor:
+    """Colour of the Gaussians as seen from `camera` [3], [gaussians, 3]."""
+    count = sh.shape[1]
+    if count == 1:
+        return torch.clamp_min(0.28209479177387814 * sh[:, 0] + 0.5, 0)
+    x, y, z = torch.nn.functional.normalize(means - camera, dim=-1).unbind(-1)
+    basis = [torch.full_like(x, 0.28209479177387814)]
+    basis += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
+    if count > 4:
+        basis += [1.0925484305920792 * x * y, -1.0925484305920792 * y * z]
+        basis += [0.31539156525252005 * (2 * z * z - x * x - y * y)]
+        basis += [-1.0925484305920792 * x * z, 0.5462742152960396 * (x * x - y * y)]
+    if count > 9:
+        basis += [-0.5900435899266435 * y * (3 * x * x - y * y), 2.890611442640554 * x * y * z]
+        basis += [-0.4570457994644658 * y * (4 * z * z - x * x - y * y)]
+        basis += [0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y)]
+        basis += [-0.4570457994644658 * x * (4 * z * z - x * x - y * y)]
+        basis += [1.445305721320277 * z * (x * x - y * y), -0.5900435899266435 * x * (x * x - 3 * y * y)]
+    return torch.clamp_min((torch.stack(basis, dim=-1)[:, :, None] * sh).sum(dim=1) + 0.5, 0)
+
+
+class _Composite(torch.autograd.Function):
+    """Front-to-back compositing of splats: values [height, width, 4] and the transmittance left [height, width]."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, centres: Tensor, conics: Tensor, opacities: Tensor, values: Tensor, width: int, height: int
+    ) -> tuple[Tensor, Tensor]:
+        """centres [splats, 2], conics [splats, 3], opacities [splats], values [splats, 4], the last of them depth."""
+        parts = (centres, conics, opacities, values)
+        xy, q, o, v = (np.ascontiguousarray(part.detach().numpy()) for part in parts)
+        order = np.argsort(v[:, 3], kind="stable")
+        image = np.zeros((height, width, 4), v.dtype)
+        transmittance = np.ones((height, width), v.dtype)
+        last = np.full((height, width), -1)
+        _composite(xy, q, o, v, order, image, transmittance, last)
+        ctx.parts = (xy, q, o, v, order, transmittance, last)
+        return torch.from_numpy(image), torch.from_numpy(transmittance)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        """Gradients for centres, conics, opacities and values."""
+        for_image, for_transmittance = (np.ascontiguousarray(part.numpy()) for part in gradients)
+        xy, q, o, v, order, transmittance, last = ctx.parts
+        for_xy, for_q, for_o, for_v = np.zeros_like(xy), np.zeros_like(q), np.zeros_like(o), np.zeros_like(v)
+        _composite_backward(
+            xy, q, o, v, order, transmittance, last, for_image, for_transmittance, for_xy, for_q, for_o, for_v
+        )
+        return *(torch.from_numpy(part) for part in (for_xy, for_q, for_o, for_v)), None, None
+
+
+@_compiled()
+def _box(
+    centres: np.ndarray, conics: np.ndarray, opacity: float, splat: int, width: int, height: int
+) -> tuple[int, int, int, int]:
+    """The pixels (columns from, to, rows from, to) where the splat's alpha can reach MIN_ALPHA."""
+    reach = 2 * np.log(opacity / MIN_ALPHA)
+    if not reach > 0:
+        return 0, 0, 0, 0
+    determinant = conics[splat, 0] * conics[splat, 2] - conics[splat, 1] * conics[splat, 1]
+    if not determinant > 0:
+        return 0, 0, 0, 0
+    half_x, half_y = np.sqrt(reach * conics[splat, 2] / determinant), np.sqrt(reach * conics[splat, 0] / determinant)
+    x, y = centres[splat, 0] - 0.5, centres[splat, 1] - 0.5
+    return (
+        int(min(max(np.ceil(x - half_x), 0), width)),
+        int(min(max(np.floor(x + half_x) + 1, 0), width)),
+        int(min(max(np.ceil(y - half_y), 0), height)),
+        int(min(max(np.floor(y + half_y) + 1, 0), height)),
+    )
+
+
+@_compiled()
+def _composite(
+    centres: np.ndarray,
+    conics: np.ndarray,
+    opacities: np.ndarray,
+    values: np.ndarray,
+    order: np.ndarray,
+    image: np.ndarray,
+    transmittance: np.ndarray,
+    last: np.ndarray,
+) -> None:
+    """Add the splats in `order` to `image`; `last`: the place in `order` of each pixel's last splat.
+
+    A pixel that is full has `transmittance` negated until all is done.
+    """
+    height, width = transmittance.shape
+    for place in range(len(order)):
+        splat = order[place]
+        left, right, top, bottom = _box(centres, conics, opacities[splat], splat, width, height)
+        xx, xy, yy, opacity = conics[splat, 0], conics[splat, 1], conics[splat, 2], opacities[splat]
+        for row in range(top, bottom):
+            dy = row + 0.5 - centres[splat, 1]
+            for column in range(left, right):
+                before = transmittance[row, column]
+                if before < 0:
+                    continue
+                dx = column + 0.5 - centres[splat, 0]
+                sigma = 0.5 * (xx * dx * dx + yy * dy * dy) + xy * dx * dy
+                alpha = min(MAX_ALPHA, opacity * np.exp(-sigma))
+                if alpha < MIN_ALPHA:
+                    continue
+                after = before * (1 - alpha)
+                if after <= MIN_TRANSMITTANCE:
+                    transmittance[row, column] = -before
+                    continue
+                weight = alpha * before
+                for channel in range(4):
+                    image[row, column, channel] += weight * values[splat, channel]
+                transmittance[row, column] = after
+                last[row, column] = place
+    for row in range(height):
+        for column in range(width):
+            transmittance[row, column] = abs(transmittance[row, column])
+
+
+@_compiled()
+def _composite_backward(
+    centres: np.ndarray,
+    conics: np.ndarray,
+    opacities: np.ndarray,
+    values: np.ndarray,
+    order: np.ndarray,
+    transmittance: np.ndarray,
+    last: np.ndarray,
+    image_gradient: np.ndarray,
+    transmittance_gradient: np.ndarray,
+    centre_gradients: np.ndarray,
+    conic_gradients: np.ndarray,
+    opacity_gradients: np.ndarray,
+    value_gradients: np.ndarray,
+) -> None:
+    """Fill the gradients, back to front: the transmittance before a splat is that behind it divided by 1 - alpha."""
+    height, width = transmittance.shape
+    through = transmittance.astype(np.float64)  # behind the splat at hand
+    # What a unit of light behind the splat at hand is worth, times `through`.
+    behind = transmittance_gradient * through
+    for place in range(len(order) - 1, -1, -1):
+        splat = order[place]
+        left, right, top, bottom = _box(centres, conics, opacities[splat], splat, width, height)
+        xx, xy, yy, opacity = conics[splat, 0], conics[splat, 1], conics[splat, 2], opacities[splat]
+        for row in range(top, bottom):
+            dy = row + 0.5 - centres[splat, 1]
+            for column in range(left, right):
+                if place > last[row, column]:
+                    continue
+                dx = column + 0.5 - centres[splat, 0]
+                sigma = 0.5 * (xx * dx * dx + yy * dy * dy) + xy * dx * dy
+                fall = np.exp(-sigma)
+                alpha = min(MAX_ALPHA, opacity * fall)
+                if alpha < MIN_ALPHA:
+                    continue
+                before = through[row, column] / (1 - alpha)
+                worth = 0.0
+                for channel in range(4):
+                    value_gradients[splat, channel] += alpha * before * image_gradient[row, column, channel]
+                    worth += values[splat, channel] * image_gradient[row, column, channel]
+                alpha_gradient = before * worth - behind[row, column] / (1 - alpha)
+                behind[row, column] += alpha * before * worth
+                through[row, column] = before
+                if opacity * fall >= MAX_ALPHA:
+                    continue
+                opacity_gradients[splat] += fall * alpha_gradient
+                sigma_gradient = -alpha * alpha_gradient
+                conic_gradients[splat, 0] += 0.5 * dx * dx * sigma_gradient
+                conic_gradients[splat, 1] += dx * dy * sigma_gradient
+                conic_gradients[splat, 2] += 0.5 * dy * dy * sigma_gradient
+                centre_gradients[splat, 0] -= (xx * dx + xy * dy) * sigma_gradient
+                centre_gradients[splat, 1] -= (yy * dy + xy * dx) * sigma_gradient
