@@ -29,6 +29,7 @@ PROJECTED_AT_ONCE = 1 << 15  # splats: the temporaries of a block stay in the ca
 FRAGMENTS_AT_ONCE = 1 << 18  # likewise
 # NumPy sorts 16-bit integers by radix, several times faster than wider ones, so a band has no more pixels than this.
 BAND_PIXELS = 1 << 16
+MAX_PIXELS = 1 << 27  # 20 bytes each, and as much again while the results are put together
 MIN_BANDS = 8  # several a core, so that the cores finish together
 MOST_THREADS = 8  # each holds the fragments of a chunk, some 30 MB
 
@@ -356,6 +357,8 @@ def _checked_camera(viewmat: np.ndarray, K: np.ndarray, width: int, height: int,
     """The camera, once it is a pinhole camera with an image that can be drawn."""
     if not (1 <= width <= BAND_PIXELS and 1 <= height <= BAND_PIXELS):
         raise InputError(f"rasterize: the image is {width}x{height}, expected sides of 1 to {BAND_PIXELS} pixels")
+    if width * height > MAX_PIXELS:
+        raise InputError(f"rasterize: the image is {width}x{height}, expected at most {MAX_PIXELS} pixels in all")
     if not near > 0:
         raise InputError(f"rasterize: near is {near}, expected a positive distance in world units")
     viewmat = _checked("viewmat", viewmat, (4, 4), np.float64)

@@ -193,6 +193,11 @@ def test_wrong_arguments_are_named(name: str, value: object, message: str) -> No
         rasterize(**VALID | {name: value})
 
 
+def test_an_image_too_large_for_memory_is_refused() -> None:
+    with pytest.raises(InputError, match=r"image is 60000x60000, expected at most \d+ pixels"):
+        rasterize(**VALID | {"width": 60000, "height": 60000})
+
+
 def test_package_exports_rasterize_without_loading_it() -> None:
     program = (
         "import sys, idesplat.runtime as runtime\n"
