@@ -1,0 +1,52 @@
+"""Pictures out: colours and depth as 8-bit PNG files that appear whole or not at all."""
+
+from pathlib import Path
+
+import numpy as np
+
+from .errors import InputError
+from .files import replacing
+
+NEAREST_SHARE, FARTHEST_SHARE = 98, 2  # percentiles of inverse depth that get the ends of the colour map
+
+
+def save_png(path: Path, rgb: np.ndarray) -> None:
+    """Write colours in [0, 1], [height, width, 3], as an 8-bit PNG; what lies outside is clipped.
+
+    Raises InputError if the file cannot be written.
+    """
+    _save(path, _to_bytes(rgb)[..., ::-1])
+
+
+def save_depth_png(path: Path, depth: np.ndarray) -> None:
+    """Write depth in world units, [height, width], in colours from blue (far) to red (near), by inverse depth.
+
+    The nearest and farthest 2 % share the end colours. Depth that is not positive and finite becomes black.
+    Raises InputError if the file cannot be written.
+    """
+    import cv2
+
+    known = np.isfinite(depth) & (depth > 0)
+    inverse_depth = 1 / np.where(known, depth, 1)
+    far, near = np.percentile(inverse_depth[known], (FARTHEST_SHARE, NEAREST_SHARE)) if known.any() else (0, 1)
+    warmth = (inverse_depth - far) / (near - far) if near > far else np.full(depth.shape, 0.5)
+    picture = cv2.applyColorMap(_to_bytes(warmth), cv2.COLORMAP_TURBO)
+    picture[~known] = 0
+    _save(path, picture)
+
+
+def _to_bytes(values: np.ndarray) -> np.ndarray:
+    """Numbers in [0, 1] as uint8, rounded."""
+    return np.rint(np.clip(values, 0, 1) * 255).astype(np.uint8)
+
+
+def _save(path: Path, bgr: np.ndarray) -> None:
+    """Write OpenCV's kind of image as a PNG."""
+    import cv2  # here, so that a command can say what it does without loading OpenCV
+
+    _, encoded = cv2.imencode(".png", bgr)
+    try:
+        with replacing(path) as temporary:
+            temporary.write_bytes(encoded.data)
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror}; choose a file on a disk with room for it") from None
