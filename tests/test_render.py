@@ -254,7 +254,7 @@ def test_near_is_warm_and_unknown_is_black(tmp_path: Path) -> None:
     assert red > green + 50 and red > blue + 50
     red, green, blue = picture[10, 95]
     assert blue > red + 50
-    # Colours follow inverse depth: the column in the middle, though at depth 1.8 of 1 to 10, is the map's middle, green.
+    # Colours follow inverse depth: the middle column, though at depth 1.8 of 1 to 10, has the map's middle, green.
     red, green, blue = picture[10, 50]
     assert green > red + 50 and green > blue + 50
 
