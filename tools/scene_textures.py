@@ -37,12 +37,12 @@ def texture_bank(seed: int, count: int) -> Textures:
 
 
 def _mip_levels(colours: np.ndarray) -> np.ndarray:
-    """All levels of `colours` [SIZE, SIZE, 3] in [0, 1], one after the other, uint8 [texels, 3]."""
-    levels = [colours.astype(np.float32)]
+    """All levels of `colours` [SIZE, SIZE, 3], one after the other, uint8 [texels, 3]."""
+    levels = [colours.clip(0, 1).astype(np.float32)]
     for _ in range(LEVELS - 1):
         half = levels[-1].shape[0] // 2
         levels.append(np.asarray(cv2.resize(levels[-1], (half, half), interpolation=cv2.INTER_AREA), np.float32))
-    return np.concatenate([np.rint(level.clip(0, 1) * 255).astype(np.uint8).reshape(-1, 3) for level in levels])
+    return np.concatenate([np.rint(level * 255).astype(np.uint8).reshape(-1, 3) for level in levels])
 
 
 def _palette(rng: np.random.Generator, count: int | np.integer) -> np.ndarray:

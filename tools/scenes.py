@@ -18,7 +18,8 @@ HELD_OUT_SEEDS = range(1_000_001_000, 1_000_001_200)
 WIDE_NEAR, WIDE_FAR = 0.5, 100.0  # the depth range that photographs without a better one are given
 WIDE_SHARE = 0.6  # of the samples have that range, the others a tight one
 PROBE = 24  # pixels: the small depth map by which a camera is judged
-ATTEMPTS = 60
+ATTEMPTS = 60  # to place the cameras of a sample
+GOOD_OVERLAP = 0.6  # share of the first view's points that each other view should see
 
 
 @dataclass(frozen=True)
@@ -108,6 +109,18 @@ def look_at(eye: np.ndarray, focus: np.ndarray, roll: float = 0.0) -> np.ndarray
     return pose
 
 
+def probe(scene: Scene, pose: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    """A small depth map [PROBE, PROBE]; zeros where the camera stands outside of everything."""
+    bare = Textures(np.zeros((1, 1, 3), np.uint8), ())
+    _, depth = photograph(scene, bare, pose, intrinsics, PROBE, PROBE, 0)
+    return depth if np.isfinite(depth).all() else np.zeros_like(depth)
+
+
+def relief(seen: np.ndarray) -> float:
+    """The share of neighbouring depths of a probe that lie more than a tenth apart."""
+    return float((np.abs(np.diff(np.log(seen), axis=1)) > 0.1).mean())
+
+
 def _sample_offsets(samples: int) -> np.ndarray:
     """Well spread places inside a pixel (Hammersley points), [samples, 2]."""
     index = np.arange(samples)
@@ -134,28 +147,29 @@ def _draw_cameras(
     rng: np.random.Generator, layout: Layout, intrinsics: np.ndarray, context: int, targets: int
 ) -> np.ndarray:
     """Poses [views, 4, 4] that see the scene from outside its solids and overlap; the best found if none is perfect."""
-    best, best_score = np.empty(0), -np.inf
+    best, best_score = np.empty(0), 0.0
     for _ in range(ATTEMPTS):
         first = look_at(rng.uniform(*layout.eyes), rng.uniform(*layout.focus), rng.normal(0, 0.06))
-        seen = _probe(layout.scene, first, intrinsics[0])
-        if seen.min() < 0.2 * np.median(seen):  # inside a solid, or right before one
+        seen = probe(layout.scene, first, intrinsics[0])
+        if seen.min() <= 0.2 * np.median(seen):  # inside a solid, or right before one
             continue
-        if _relief(seen) < 0.02 and rng.random() < 0.8:  # nothing but flat walls: some of those will do
+        if relief(seen) < 0.02 and rng.random() < 0.8:  # nothing but flat walls: some of those will do
             continue
-        poses = _draw_neighbours(rng, layout, first, float(np.median(seen)), context, targets)
-        score = min(_overlap(layout.scene, poses, intrinsics, seen, index) for index in range(1, len(poses)))
+        poses = _draw_neighbours(rng, first, float(np.median(seen)), context, targets)
+        score = min((_overlap(layout.scene, poses, intrinsics, seen, i) for i in range(1, len(poses))), default=1.0)
         if score > best_score:
             best, best_score = poses, score
-        if score > 0.6:
+        if score > GOOD_OVERLAP:
             break
-    if not len(best):  # nowhere to stand: a row of cameras at the first place tried
+    if best_score == 0.0:  # always blocked: a row of cameras, close together, in the middle of where they may stand
+        first = look_at(layout.eyes.mean(axis=0), layout.focus[1])
         best = np.stack([first] * (context + targets))
-        best[1:, :3, 3] += 0.01 * np.arange(1, context + targets)[:, None] * first[:3, 0]
+        best[:, :3, 3] += 0.01 * np.arange(context + targets)[:, None] * first[:3, 0]
     return best
 
 
 def _draw_neighbours(
-    rng: np.random.Generator, layout: Layout, first: np.ndarray, distance: float, context: int, targets: int
+    rng: np.random.Generator, first: np.ndarray, distance: float, context: int, targets: int
 ) -> np.ndarray:
     """Context poses on a path from `first` on, a few to 30 % of `distance` apart, and targets between and around."""
     baseline = np.exp(rng.uniform(np.log(0.03), np.log(0.3))) * distance
@@ -174,22 +188,10 @@ def _draw_neighbours(
     return poses
 
 
-def _probe(scene: Scene, pose: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    """A small depth map [PROBE, PROBE]; zeros where the camera stands outside of everything."""
-    bare = Textures(np.zeros((1, 1, 3), np.uint8), ())
-    _, depth = photograph(scene, bare, pose, intrinsics, PROBE, PROBE, 0)
-    return depth if np.isfinite(depth).all() else np.zeros_like(depth)
-
-
-def _relief(seen: np.ndarray) -> float:
-    """The share of neighbouring depths of a probe that lie more than a tenth apart."""
-    return float((np.abs(np.diff(np.log(seen), axis=1)) > 0.1).mean())
-
-
 def _overlap(scene: Scene, poses: np.ndarray, intrinsics: np.ndarray, seen: np.ndarray, view: int) -> float:
     """The share of the first view's points (depths `seen`) inside view `view`'s image; negative if that is blocked."""
-    depth = _probe(scene, poses[view], intrinsics[view])
-    if depth.min() < 0.12 * np.median(depth) or not 0.4 < np.median(depth) / np.median(seen) < 2.5:
+    depth = probe(scene, poses[view], intrinsics[view])
+    if depth.min() <= 0.12 * np.median(depth) or not 0.4 < np.median(depth) / np.median(seen) < 2.5:
         return -1.0
     centres = (np.arange(PROBE) + 0.5) / PROBE
     pixels = np.stack([*np.meshgrid(centres, centres), np.ones((PROBE, PROBE))], axis=-1)
@@ -204,7 +206,7 @@ def _draw_range(rng: np.random.Generator, depth: np.ndarray) -> tuple[float, flo
     """The factor that brings the scene to its final units, and near and far there."""
     least, most = float(depth.min()), float(depth.max())
     scale = np.exp(rng.uniform(np.log(1.5), np.log(8.0))) / float(np.median(depth))
-    if rng.random() < WIDE_SHARE:
+    if rng.random() < WIDE_SHARE and most / least < 0.9 * WIDE_FAR / WIDE_NEAR:
         scale = min(max(scale, 1.05 * WIDE_NEAR / least), 0.95 * WIDE_FAR / most)
         return scale, WIDE_NEAR, WIDE_FAR
     near, far = least * rng.uniform(0.5, 0.95), most * rng.uniform(1.05, 2.0)
