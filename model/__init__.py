@@ -1,1 +1,1 @@
-"""The networks, written so that they can leave PyTorch: no custom operators, no linear algebra routines, integer gathers."""
+"""The networks, written so that they can leave PyTorch: no custom operators, no linear algebra, integer gathers."""

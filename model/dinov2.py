@@ -5,6 +5,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .config import ViTConfig
+from .layers import attention, to_map, to_tokens
 
 NORM_EPSILON = 1e-6
 # DINOv2 adds this to the size asked of the position embedding's interpolation, and its weights expect it.
@@ -18,15 +19,15 @@ class Attention(nn.Module):
 
     def __init__(self, dim: int, heads: int) -> None:
         super().__init__()
-        self.heads = heads
+        self.heads, self.head_channels = heads, dim // heads
         self.qkv = nn.Linear(dim, 3 * dim)
         self.proj = nn.Linear(dim, dim)
 
     def forward(self, x: Tensor) -> Tensor:
         """[n, tokens, dim] -> the same shape."""
-        qkv = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
+        qkv = self.qkv(x).reshape(x.shape[0], -1, 3, self.heads, self.head_channels).permute(2, 0, 3, 1, 4)
         q, k, v = qkv.unbind(0)  # [n, heads, tokens, dim / heads]
-        return self.proj(F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
+        return self.proj(attention(q, k, v).transpose(1, 2).reshape(x.shape[0], -1, self.heads * self.head_channels))
 
 
 class Block(nn.Module):
@@ -62,22 +63,22 @@ class DinoV2(nn.Module):
         nn.init.trunc_normal_(self.pos_embed, std=0.02)
 
     def forward(self, images: Tensor) -> list[Tensor]:
-        """Normalised images [n, 3, H, W], H and W multiples of the patch -> four maps [n, dim, H / patch, W / patch]."""
+        """Normalised images [n, 3, H, W], multiples of the patch -> four maps [n, dim, H / patch, W / patch]."""
         patches = self.patch_embed(images)
         count, _, rows, columns = patches.shape
-        x = torch.cat([self.cls_token.expand(count, -1, -1), patches.flatten(2).transpose(1, 2)], dim=1)
+        x = torch.cat([self.cls_token.expand(count, -1, -1), to_tokens(patches)], dim=1)
         x = x + self._position_embedding(rows, columns)
         maps = []
         for index, block in enumerate(self.blocks):
             x = block(x)
             if index in self.config.taps:
-                maps.append(self.norm(x)[:, 1:].transpose(1, 2).unflatten(2, (rows, columns)))
+                maps.append(to_map(self.norm(x)[:, 1:], rows, columns))
         return maps
 
     def _position_embedding(self, rows: int, columns: int) -> Tensor:
         """The trained square of position embeddings, interpolated bicubically: [1, 1 + rows * columns, dim]."""
         grid = self.config.grid
-        square = self.pos_embed[0, 1:].unflatten(0, (grid, grid)).permute(2, 0, 1)  # [dim, grid, grid]
+        square = self.pos_embed[0, 1:].reshape(grid, grid, -1).permute(2, 0, 1)  # [dim, grid, grid]
         # At the trained size the embedding is taken as it is: without the offset the weights are the identity.
         ones = square.new_ones
         trained = ((ones(rows).sum() == grid) & (ones(columns).sum() == grid)).to(square.dtype)

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from .config import DPBUConfig, IDESplatConfig
 from .encoder import Encoded
 from .epipolar_attention import EpipolarAttention
-from .geometry import nearest_pixels, nearest_views, scale_intrinsics
-from .layers import Merge, Upsample2x, resize
+from .geometry import nearest_pixels, scale_intrinsics
+from .layers import Merge, Upsample2x, fixed, resize
 
 
 class Cameras(NamedTuple):
@@ -22,6 +22,7 @@ class Cameras(NamedTuple):
     intrinsics: Tensor  # [views, 3, 3] normalised by width and height
     near: Tensor  # [views]
     far: Tensor  # [views]
+    neighbours: Tensor  # [views, n], the views that each is matched with
 
 
 class Boosted(NamedTuple):
@@ -41,7 +42,6 @@ class DepthProbabilityBoostingUnit(nn.Module):
 
     def __init__(self, config: IDESplatConfig, unit: DPBUConfig) -> None:
         super().__init__()
-        self.neighbours = config.neighbours
         self.first = EpipolarAttention(unit, config.ffn_ratio, config.ffn_kernel)
         self.second = EpipolarAttention(unit, config.ffn_ratio, config.ffn_kernel)
 
@@ -49,10 +49,9 @@ class DepthProbabilityBoostingUnit(nn.Module):
         self, features: Tensor, seed: Tensor, candidates: Tensor, cameras: Cameras
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Two layers over the same warp indices -> features, inverse depth of the first, of both, probability."""
-        views, _, height, width = features.shape
-        neighbours = nearest_views(cameras.extrinsics, self.neighbours)
+        height, width = features.shape[2:]
         pixels = scale_intrinsics(cameras.intrinsics, height, width)
-        rows = nearest_pixels(candidates, pixels, cameras.extrinsics, neighbours)
+        rows = nearest_pixels(candidates, pixels, cameras.extrinsics, cameras.neighbours)
         features, prior = self.first(features, seed, rows, None)
         first_depth, _ = expectation(prior, candidates)
         features, posterior = self.second(features, first_depth, rows, prior)
@@ -123,9 +122,10 @@ class FinerUnit(DepthProbabilityBoostingUnit):
 
 
 def expectation(probability: Tensor, candidates: Tensor) -> tuple[Tensor, Tensor]:
-    """Probabilities [pairs, candidates, h * w] -> expected inverse depth [views, 1, h, w], probability [views, candidates, h, w]."""
+    """Probabilities [pairs, candidates, h * w] -> expected inverse depth and probabilities, by view as maps."""
     views, _, height, width = candidates.shape
-    probability = probability.unflatten(0, (views, -1)).mean(1).unflatten(2, (height, width))
+    count = fixed(candidates.shape[1])
+    probability = probability.reshape(views, -1, count, height * width).mean(1).reshape(-1, count, height, width)
     return (probability * candidates).sum(1, keepdim=True), probability
 
 

@@ -7,6 +7,9 @@ from torch import Tensor, nn
 from .config import DPTConfig
 from .layers import resize
 
+# Stands for the largest disparity where all are zero, so that an untrained head yields zeros and not NaN.
+TINY = 1e-12
+
 
 class ResidualConvUnit(nn.Module):
     """Two activated 3x3 convolutions and a shortcut."""
@@ -74,4 +77,4 @@ class DPTHead(nn.Module):
         x = resize(self.disparity1(features), rows * self.patch, columns * self.patch)
         depth = F.relu(self.disparity3(F.relu(self.disparity2(x))))
         disparity = torch.where(depth == 0, 0.0, 1 / depth)
-        return disparity / disparity.amax()
+        return disparity / disparity.max().clamp(min=TINY)

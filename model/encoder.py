@@ -9,7 +9,6 @@ from .backbone import Backbone
 from .config import IDESplatConfig
 from .dinov2 import DinoV2
 from .dpt import DPTHead
-from .geometry import nearest_views
 from .layers import resize
 from .mv_transformer import MultiViewTransformer
 
@@ -41,11 +40,11 @@ class Encoder(nn.Module):
         self.vit = DinoV2(config.vit)
         self.dpt = DPTHead(config.vit.dim, config.vit.patch, config.dpt)
 
-    def forward(self, images: Tensor, extrinsics: Tensor) -> Encoded:
-        """Images [views, 3, H, W] in [0, 1], extrinsics [views, 4, 4] -> the encoder's maps."""
+    def forward(self, images: Tensor, neighbours: Tensor) -> Encoded:
+        """Images [views, 3, H, W] in [0, 1], neighbours [views, n] -> the encoder's maps."""
         images = normalise(images)
         cnn, cnn_fine = self.backbone(images)
-        mv = self.transformer(cnn, nearest_views(extrinsics, self.config.neighbours))
+        mv = self.transformer(cnn, neighbours)
 
         patch = self.config.vit.patch
         rows, columns = images.shape[2] // patch, images.shape[3] // patch

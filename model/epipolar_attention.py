@@ -1,17 +1,18 @@
-"""One warp-index epipolar attention layer: each pixel attends to the pixels its depth candidates fall on in other views.
+"""One warp-index epipolar attention layer: pixels attend to where their depth candidates fall in other views.
 
 The releases multiply sparsely in a CUDA extension; here the same sums run over integer gathers of feature rows.
 """
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .config import DPBUConfig
-from .layers import ConvFFN, to_map, to_tokens
+from .layers import ConvFFN, fixed, repeat_views, to_map, to_tokens
 from .unet import CostRegulariser
 
 # Candidates gathered at once: it bounds the memory to this many copies of the features.
-CHUNK = 4
+CHUNK = 8
 # Keeps the renormalised product of probabilities away from zero.
 EPSILON = 1e-10
 
@@ -54,7 +55,9 @@ class EpipolarAttention(nn.Module):
         scores = correlate(queries, pixel_table(self.k_proj(normed)), rows)  # [pairs, candidates, h * w]
         scores = scores + queries.sum(-1)[:, None] * self.key_position[:, None] + self.score_position[:, None]
 
-        known = torch.cat([repeat_views(seed, neighbours), scores.unflatten(2, (height, width))], dim=1)
+        known = torch.cat(
+            [repeat_views(seed, neighbours), scores.reshape(-1, fixed(scores.shape[1]), height, width)], dim=1
+        )
         probability = self.regulariser(known, views).flatten(2)
         if prior is not None:  # depth probability boosting
             product = probability * prior
@@ -62,14 +65,9 @@ class EpipolarAttention(nn.Module):
 
         gathered = weigh(probability, pixel_table(self.v_proj(normed)), rows)  # [pairs, h * w, channels]
         gathered = gathered + (probability * self.value_position[:, None]).sum(1)[..., None]
-        tokens = tokens + self.proj(gathered.unflatten(0, (views, neighbours)).mean(1))
+        tokens = tokens + self.proj(gathered.reshape(views, neighbours, -1, fixed(gathered.shape[2])).mean(1))
         tokens = tokens + self.ffn(self.norm2(tokens), height, width)
         return to_map(tokens, height, width), probability
-
-
-def repeat_views(x: Tensor, neighbours: int) -> Tensor:
-    """Each view's entry once for each of its neighbours: [views, ...] -> [views * neighbours, ...]."""
-    return x[:, None].expand(-1, neighbours, *x.shape[1:]).flatten(0, 1)
 
 
 def pixel_table(tokens: Tensor) -> Tensor:
@@ -80,14 +78,17 @@ def pixel_table(tokens: Tensor) -> Tensor:
 
 def correlate(queries: Tensor, table: Tensor, rows: Tensor) -> Tensor:
     """Inner products of queries [pairs, h * w, channels] with the table's rows: [pairs, candidates, h * w]."""
-    scores = [
-        (table[chunk] * queries[:, None]).sum(-1)  # [pairs, chunk, h * w]
-        for chunk in rows.split(CHUNK, dim=1)
-    ]
+    queries = queries[:, None]
+    starts = range(0, fixed(rows.shape[1]), CHUNK)
+    scores = [(F.embedding(rows[:, start : start + CHUNK], table) * queries).sum(-1) for start in starts]
     return torch.cat(scores, dim=1)
 
 
 def weigh(probability: Tensor, table: Tensor, rows: Tensor) -> Tensor:
-    """The table's rows [pairs, candidates, h * w] summed with the probabilities as weights: [pairs, h * w, channels]."""
-    chunks = zip(probability.split(CHUNK, dim=1), rows.split(CHUNK, dim=1), strict=True)
-    return sum((weight[..., None] * table[chunk]).sum(1) for weight, chunk in chunks)
+    """The table's rows [pairs, candidates, h * w] summed by probability: [pairs, h * w, channels]."""
+    probability = probability[..., None]
+    total = torch.zeros_like(probability[:, 0])
+    for start in range(0, fixed(rows.shape[1]), CHUNK):
+        chunk = slice(start, start + CHUNK)
+        total = total + (F.embedding(rows[:, chunk], table) * probability[:, chunk]).sum(1)
+    return total

@@ -33,6 +33,8 @@ class WorldGaussians(NamedTuple):
 class GaussianAdapter(nn.Module):
     """Raw parameters a pixel: opacity logit, offset x y, scales, quaternion xyzw in the camera's frame, harmonics."""
 
+    sh_decay: Tensor
+
     def __init__(self, sh_degree: int, scale_min: float, scale_max: float) -> None:
         super().__init__()
         self.scale_min, self.scale_max = scale_min, scale_max
@@ -51,7 +53,7 @@ class GaussianAdapter(nn.Module):
         camera = cameras.extrinsics[:, :3, :3]
         quats = quaternion_product(quaternion_from_matrix(camera)[:, None], _normalise_quaternion(rotations))
         colours = (images.flatten(2).transpose(1, 2) - 0.5) / SH_C0  # [views, H * W, 3]
-        sh = self._world_harmonics(sh.unflatten(-1, (3, self.coefficients)), colours, camera)
+        sh = self._world_harmonics(sh.reshape(*sh.shape[:2], 3, self.coefficients), colours, camera)
         gaussians = WorldGaussians(means, scales, quats, logits.sigmoid()[..., 0], sh)
         return WorldGaussians(*(x.flatten(0, 1) for x in gaussians))
 

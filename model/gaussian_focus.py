@@ -1,12 +1,11 @@
 """The Gaussian focused module: window attention whose layers keep ever fewer neighbours of each pixel."""
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .config import FocusConfig
 from .layers import ConvFFN, DepthwiseConv, to_map, to_tokens
-from .windows import join_windows, region_mask, split_windows
+from .windows import join_windows, region_mask, shift_back, split_windows
 
 EPSILON = 1e-10
 
@@ -43,9 +42,12 @@ class FocusedLayer(nn.Module):
     dense, with zeros where a neighbour has been dropped: the same sums without a custom kernel.
     """
 
+    position_index: Tensor
+
     def __init__(self, config: FocusConfig, index: int, ffn_ratio: int, ffn_kernel: int) -> None:
         super().__init__()
         channels, self.window, self.heads = config.channels, config.window, config.heads
+        self.head_channels = channels // self.heads
         tokens = self.window**2
         self.shifted = index % 2 == 1
         self.topk = config.topk[index]
@@ -79,9 +81,9 @@ class FocusedLayer(nn.Module):
 
     def _attend(self, q: Tensor, k: Tensor, before: Tensor | None, mask: Tensor) -> Tensor:
         """Attention over the neighbours that are left, the `topk` strongest kept."""
-        scores = (q * q.shape[-1] ** -0.5) @ k.transpose(-1, -2)  # [views, windows, heads, tokens, tokens]
+        scores = (q * self.head_channels**-0.5) @ k.transpose(-1, -2)  # [views, windows, heads, tokens, tokens]
         scores = scores + self.position_bias[self.position_index].permute(2, 0, 1)
-        if self.narrowed:
+        if before is not None and self.narrowed:
             # The releases leave the mask away from here on: what it hid has all but zero weight in `before`.
             scores = torch.where(before > 0, scores, -torch.inf)
         elif self.shifted:
@@ -98,19 +100,20 @@ class FocusedLayer(nn.Module):
         return attention
 
     def _split(self, tokens: Tensor, height: int, width: int) -> Tensor:
-        """[views, h * w, channels] -> [views, windows, heads, tokens, channels / heads], shifted where this layer is."""
-        image = tokens.unflatten(1, (height, width))
+        """[views, h * w, channels] -> [views, windows, heads, tokens, channels / heads], shifted in odd layers."""
+        image = tokens.reshape(-1, height, width, self.heads * self.head_channels)
         if self.shifted:
-            image = torch.roll(image, (-(self.window // 2), -(self.window // 2)), (1, 2))
+            image = shift_back(image, self.window // 2, self.window // 2)
         windows = split_windows(image, self.window, self.window)
-        return windows.unflatten(-1, (self.heads, -1)).transpose(2, 3)
+        return windows.reshape(tokens.shape[0], -1, self.window**2, self.heads, self.head_channels).transpose(2, 3)
 
     def _join(self, windows: Tensor, height: int, width: int) -> Tensor:
         """The inverse of `_split`."""
-        image = join_windows(windows.transpose(2, 3).flatten(3), height, width, self.window, self.window)
+        windows = windows.transpose(2, 3).reshape(-1, self.window**2, self.heads * self.head_channels)
+        image = join_windows(windows, height, width, self.window, self.window)
         if self.shifted:
-            image = torch.roll(image, (self.window // 2, self.window // 2), (1, 2))
-        return image.flatten(1, 2)
+            image = shift_back(image, height - self.window // 2, width - self.window // 2)
+        return image.reshape(-1, height * width, self.heads * self.head_channels)
 
 
 def relative_position_index(window: int) -> Tensor:

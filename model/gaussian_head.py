@@ -71,7 +71,9 @@ class GaussianStage(nn.Module):
         probability = self.residual(known, last.features.shape[0])
         residual = (probability * last.candidates).sum(1, keepdim=True)
         maps = [*(unit.inverse_depth for unit in units), residual]
-        fused = sum(share * resize(x, height, width) for share, x in zip(DEPTH_SHARES, maps, strict=True))
+        fused = torch.zeros_like(maps[0][:, :, :1, :1])
+        for share, x in zip(DEPTH_SHARES, maps, strict=True):
+            fused = fused + share * resize(x, height, width)
         near, far = (x[:, None, None, None] for x in (cameras.near, cameras.far))
         return torch.minimum(torch.maximum(fused, 1 / far), 1 / near)
 

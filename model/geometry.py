@@ -1,10 +1,12 @@
 """Cameras and projections in closed form: rigid inverses, neighbours, and where a pixel lands in another view.
 
-Frames: extrinsics are camera-to-world with OpenCV axes (x right, y down, z forward). Intrinsics [views, 3, 3] have no skew.
+Extrinsics are camera-to-world with OpenCV axes (x right, y down, z forward); intrinsics [views, 3, 3] have no skew.
 """
 
 import torch
 from torch import Tensor
+
+from .layers import repeat_views
 
 # A projection nearer to the camera plane than this, in scene units, counts as behind the camera (matching.py).
 MIN_DEPTH = 1e-3
@@ -20,12 +22,12 @@ def invert_rigid(transform: Tensor) -> Tensor:
 
 
 def invert_intrinsics(intrinsics: Tensor) -> Tensor:
-    """Inverse of skewless intrinsics [..., 3, 3]."""
+    """Inverse of skewless intrinsics [views, 3, 3]."""
     fx, fy = intrinsics[..., 0, 0], intrinsics[..., 1, 1]
     cx, cy = intrinsics[..., 0, 2], intrinsics[..., 1, 2]
     zero, one = torch.zeros_like(fx), torch.ones_like(fx)
     rows = [1 / fx, zero, -cx / fx, zero, 1 / fy, -cy / fy, zero, zero, one]
-    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+    return torch.stack(rows, dim=-1).reshape(-1, 3, 3)
 
 
 def scale_intrinsics(intrinsics: Tensor, height: int, width: int) -> Tensor:
@@ -37,7 +39,7 @@ def pixel_grid(height: int, width: int, like: Tensor) -> tuple[Tensor, Tensor]:
     """Integer pixel coordinates as floats: x and y, each [height * width], row by row."""
     x = torch.arange(width, device=like.device).to(like.dtype)
     y = torch.arange(height, device=like.device).to(like.dtype)
-    return x.repeat(height), y.repeat_interleave(width)
+    return x.repeat(height), y[:, None].expand(-1, width).flatten()
 
 
 def nearest_views(extrinsics: Tensor, count: int) -> Tensor:
@@ -57,7 +59,8 @@ def nearest_views(extrinsics: Tensor, count: int) -> Tensor:
     many = torch.ones_like(centres[:, 0]).sum() > ORDERED_VIEWS
     itself = index[:, None] == index[None]
     key = torch.where(itself, torch.inf, torch.where(many, distance, order))
-    return torch.topk(key, torch.sym_min(views - 1, count), largest=False).indices
+    # Slices stop at the end by themselves: the view itself is last, and fewer than `count` others are no special case.
+    return key.argsort(dim=1)[:, :-1][:, :count]
 
 
 def project_candidates(
@@ -68,7 +71,8 @@ def project_candidates(
     inverse_depth: candidates in 1 / scene units, [views, candidates, h, w].
     intrinsics: in pixels of the same map, [views, 3, 3]; pixel centres at integers, as the releases warp.
     extrinsics: [views, 4, 4]. neighbours: [views, n].
-    Returns x and y in pixels and whether they lie inside the map and before the camera, each [views * n, candidates, h * w].
+    Returns x and y in pixels and whether they lie inside the map and before the camera, each
+    [views * n, candidates, h * w].
     """
     _, _, height, width = inverse_depth.shape
     relative = (invert_rigid(extrinsics)[neighbours] @ extrinsics[:, None]).flatten(0, 1)  # [pairs, 4, 4]
@@ -76,8 +80,8 @@ def project_candidates(
     grid_x, grid_y = pixel_grid(height, width, inverse_depth)
     rays = invert_intrinsics(intrinsics) @ torch.stack([grid_x, grid_y, torch.ones_like(grid_x)])  # [views, 3, h * w]
     count = neighbours.shape[1]
-    rays = relative[:, :3, :3] @ rays.repeat_interleave(count, dim=0)  # [pairs, 3, h * w]
-    inverse = inverse_depth.flatten(2).repeat_interleave(count, dim=0)  # [pairs, candidates, h * w]
+    rays = relative[:, :3, :3] @ repeat_views(rays, count)  # [pairs, 3, h * w]
+    inverse = repeat_views(inverse_depth.flatten(2), count)  # [pairs, candidates, h * w]
 
     # A point at inverse depth w is (ray + shift * w) / w. The division by w cancels in the projection.
     x, y, z = (rays[:, axis : axis + 1] + relative[:, axis : axis + 1, 3:] * inverse for axis in range(3))

@@ -6,6 +6,7 @@ from .config import IDESplatConfig
 from .dpbu import Boosted, Cameras, CoarseUnit, FinerUnit
 from .encoder import Encoded, Encoder
 from .gaussian_head import GaussianStage, Predicted
+from .geometry import nearest_views
 
 
 class IDESplat(nn.Module):
@@ -31,7 +32,8 @@ class IDESplat(nn.Module):
         """Predict depth and Gaussians.
 
         images: [views, 3, H, W], RGB in [0, 1]; H and W multiples of `config.size_multiple`, two views or more.
-        extrinsics: [views, 4, 4], camera-to-world, OpenCV axes. intrinsics: [views, 3, 3], normalised by width and height.
+        extrinsics: [views, 4, 4], camera-to-world, OpenCV axes.
+        intrinsics: [views, 3, 3], normalised by width and height.
         near, far: [views], in scene units.
         """
         return self.stages(images, extrinsics, intrinsics, near, far)[-1]
@@ -40,8 +42,9 @@ class IDESplat(nn.Module):
         self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor, near: Tensor, far: Tensor
     ) -> tuple[Encoded, Boosted, Boosted, Boosted, Predicted]:
         """What each stage yields, in order, for parity and for training with every stage supervised."""
-        cameras = Cameras(extrinsics, intrinsics, near, far)
-        encoded = self.encoder(images, extrinsics)
+        neighbours = nearest_views(extrinsics, self.config.neighbours)
+        cameras = Cameras(extrinsics, intrinsics, near, far, neighbours)
+        encoded = self.encoder(images, neighbours)
         first = self.dpbu1(encoded, cameras)
         second = self.dpbu2(encoded, first, cameras)
         third = self.dpbu3(encoded, second, cameras)

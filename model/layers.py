@@ -18,6 +18,21 @@ def softmax(x: Tensor, dim: int) -> Tensor:
     return exponentials / exponentials.sum(dim, keepdim=True)
 
 
+def fixed(size: int) -> int:
+    """A size that the architecture fixes, as a plain integer, so that an export holds it as a constant."""
+    return int(size)
+
+
+def attention(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Scaled dot-product attention over the last two axes, with a constant scale in an export."""
+    return F.scaled_dot_product_attention(q, k, v, attn_mask=mask, scale=fixed(q.shape[-1]) ** -0.5)
+
+
+def repeat_views(x: Tensor, neighbours: int) -> Tensor:
+    """Each view's entry once for each of its neighbours: [views, ...] -> [views * neighbours, ...]."""
+    return x[:, None].expand(-1, neighbours, *[-1] * (x.dim() - 1)).flatten(0, 1)
+
+
 def to_tokens(x: Tensor) -> Tensor:
     """[n, channels, h, w] -> [n, h * w, channels]."""
     return x.flatten(2).transpose(1, 2)
@@ -25,7 +40,7 @@ def to_tokens(x: Tensor) -> Tensor:
 
 def to_map(tokens: Tensor, height: int, width: int) -> Tensor:
     """[n, h * w, channels] -> [n, channels, h, w]."""
-    return tokens.transpose(1, 2).unflatten(2, (height, width))
+    return tokens.transpose(1, 2).reshape(-1, fixed(tokens.shape[2]), height, width)
 
 
 class Upsample2x(nn.Sequential):

@@ -1,4 +1,4 @@
-"""The multi-view transformer: windowed self-attention within a view, cross-attention to its neighbours (GMFlow, UniMatch)."""
+"""The multi-view transformer: windows attend within a view, then to its neighbours (GMFlow, UniMatch)."""
 
 import math
 from typing import NamedTuple
@@ -7,8 +7,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from .layers import to_map, to_tokens
-from .windows import join_windows, region_mask, split_windows
+from .layers import attention, fixed, to_map, to_tokens
+from .windows import join_windows, region_mask, shift_back, split_windows
 
 POSITION_TEMPERATURE = 10000.0
 POSITION_EPSILON = 1e-6
@@ -49,17 +49,17 @@ class WindowGrid(NamedTuple):
 
     def split(self, tokens: Tensor) -> Tensor:
         """[n, h * w, channels] -> [n, windows, rows * columns, channels]."""
-        image = tokens.unflatten(1, (self.height, self.width))
+        image = tokens.reshape(-1, self.height, self.width, fixed(tokens.shape[2]))
         if self.mask is not None:
-            image = torch.roll(image, (-(self.rows // 2), -(self.columns // 2)), (1, 2))
+            image = shift_back(image, self.rows // 2, self.columns // 2)
         return split_windows(image, self.rows, self.columns)
 
     def join(self, windows: Tensor) -> Tensor:
         """The inverse of `split`."""
         image = join_windows(windows, self.height, self.width, self.rows, self.columns)
         if self.mask is not None:
-            image = torch.roll(image, (self.rows // 2, self.columns // 2), (1, 2))
-        return image.flatten(1, 2)
+            image = shift_back(image, self.height - self.rows // 2, self.width - self.columns // 2)
+        return image.reshape(-1, self.height * self.width, fixed(image.shape[3]))
 
 
 class TransformerBlock(nn.Module):
@@ -102,11 +102,11 @@ class WindowAttention(nn.Module):
         ):  # the windows of all neighbours as one sequence: [views, windows, n * tokens, channels]
             k, v = (x[neighbours].transpose(1, 2).flatten(2, 3) for x in (k, v))
             mask = None if mask is None else mask.repeat(1, 1, neighbours.shape[1])
-        return self.norm(self.merge(grid.join(F.scaled_dot_product_attention(q, k, v, attn_mask=mask))))
+        return self.norm(self.merge(grid.join(attention(q, k, v, mask))))
 
 
 def sine_position(rows: int, columns: int, channels: int, like: Tensor) -> Tensor:
-    """DETR's sine position embedding of one window, [channels, rows, columns]; y fills the first half of the channels."""
+    """DETR's sine position embedding of a window, [channels, rows, columns]; y fills the first half of them."""
     half = channels // 2
     index = torch.arange(half, device=like.device)
     frequency = POSITION_TEMPERATURE ** (2 * (index // 2).to(like.dtype) / half)

@@ -1,11 +1,11 @@
-"""The U-Net that regularises cost volumes, with attention across views at its coarsest level (the releases' ldm_unet)."""
+"""The U-Net that regularises cost volumes, with attention across views at its coarsest level (ldm_unet)."""
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .config import UNetConfig
-from .layers import GROUPS, softmax
+from .layers import GROUPS, attention, softmax
 
 
 def group_norm(channels: int) -> nn.GroupNorm:
@@ -35,21 +35,22 @@ class CrossViewAttention(nn.Module):
 
     def __init__(self, channels: int, heads: int) -> None:
         super().__init__()
-        self.heads = heads
+        self.heads, self.head_channels = heads, channels // heads
         self.norm = group_norm(channels)
         self.qkv = nn.Conv1d(channels, 3 * channels, 1)
         self.proj_out = nn.Conv1d(channels, channels, 1)
 
     def forward(self, x: Tensor, views: int) -> Tensor:
         """[groups * views, channels, h, w] -> the same shape."""
-        _, channels, height, width = x.shape
-        qkv = self.qkv(self.norm(x.flatten(2)))  # [groups * views, 3 * channels, h * w]
-        qkv = qkv.unflatten(0, (-1, views)).transpose(1, 2).flatten(2)  # [groups, 3 * channels, views * h * w]
-        q, k, v = qkv.unflatten(1, (self.heads, 3, -1)).unbind(2)  # [groups, heads, channels / heads, views * h * w]
-        out = F.scaled_dot_product_attention(q.transpose(2, 3), k.transpose(2, 3), v.transpose(2, 3))
-        out = out.transpose(2, 3).flatten(1, 2)  # [groups, channels, views * h * w]
-        out = out.unflatten(2, (views, -1)).transpose(1, 2).flatten(0, 1)
-        return x + self.proj_out(out).unflatten(2, (height, width))
+        height, width = x.shape[2:]
+        pixels = height * width
+        qkv = self.qkv(self.norm(x.flatten(2)))  # [groups * views, 3 * channels, pixels]
+        qkv = qkv.reshape(-1, views, self.heads, 3, self.head_channels, pixels).permute(3, 0, 2, 1, 5, 4)
+        q, k, v = qkv.reshape(3, -1, self.heads, views * pixels, self.head_channels).unbind(0)
+        out = attention(q, k, v)  # [groups, heads, views * pixels, channels / heads]
+        out = out.reshape(-1, self.heads, views, pixels, self.head_channels).permute(0, 2, 1, 4, 3)
+        out = out.reshape(-1, self.heads * self.head_channels, pixels)  # [groups * views, channels, pixels]
+        return x + self.proj_out(out).reshape(x.shape)
 
 
 class UNet(nn.Module):
@@ -105,6 +106,6 @@ class CostRegulariser(nn.Module):
         self.conv_out = nn.Conv2d(config.channels, candidates, 3, padding=1)
 
     def forward(self, x: Tensor, views: int) -> Tensor:
-        """[groups * views, in_channels, h, w] -> probabilities over the candidates, [groups * views, candidates, h, w]."""
+        """[groups * views, in_channels, h, w] -> probabilities [groups * views, candidates, h, w]."""
         x = F.gelu(self.norm_in(self.conv_in(x)))
         return softmax(self.conv_out(self.unet(x, views)), dim=1)

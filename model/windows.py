@@ -3,22 +3,34 @@
 import torch
 from torch import Tensor
 
+from .layers import fixed
+
 # Added to the score between tokens that only a cyclic shift brought together.
 MASKED = -100.0
 
 
 def split_windows(image: Tensor, rows: int, columns: int) -> Tensor:
     """[n, h, w, channels] -> [n, windows, rows * columns, channels]; h and w are multiples of rows and columns."""
-    count, height, width, channels = image.shape
-    image = image.reshape(count, height // rows, rows, width // columns, columns, channels)
+    count, height, width, _ = image.shape
+    channels = fixed(image.shape[3])
+    image = image.reshape(-1, height // rows, rows, width // columns, columns, channels)
     return image.permute(0, 1, 3, 2, 4, 5).reshape(count, -1, rows * columns, channels)
 
 
 def join_windows(windows: Tensor, height: int, width: int, rows: int, columns: int) -> Tensor:
-    """The inverse of `split_windows`: [n, h, w, channels]."""
-    count, _, _, channels = windows.shape
-    image = windows.reshape(count, height // rows, width // columns, rows, columns, channels)
-    return image.permute(0, 1, 3, 2, 4, 5).reshape(count, height, width, channels)
+    """The inverse of `split_windows`, from windows [..., rows * columns, channels] to [n, h, w, channels]."""
+    channels = fixed(windows.shape[-1])
+    image = windows.reshape(-1, height // rows, width // columns, rows, columns, channels)
+    return image.permute(0, 1, 3, 2, 4, 5).reshape(-1, height, width, channels)
+
+
+def shift_back(image: Tensor, rows: int, columns: int) -> Tensor:
+    """[n, h, w, channels] moved cyclically up and left by the given numbers of pixels.
+
+    torch.roll by a size that is only known at run time cannot be exported.
+    """
+    image = torch.cat([image[:, rows:], image[:, :rows]], dim=1)
+    return torch.cat([image[:, :, columns:], image[:, :, :columns]], dim=2)
 
 
 def region_mask(height: int, width: int, rows: int, columns: int, like: Tensor) -> Tensor:

@@ -20,7 +20,8 @@ def replacing(path: Path) -> Iterator[Path]:
     try:
         handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
     except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror}; choose a folder that exists and is writable") from None
+        reason = f"cannot write {path}: {error.strerror}"
+        raise InputError(f"{reason}; choose a folder that exists and is writable") from None
     os.close(handle)
     temporary = Path(name)
     try:
