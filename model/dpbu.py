@@ -22,7 +22,6 @@ class Cameras(NamedTuple):
     intrinsics: Tensor  # [views, 3, 3] normalised by width and height
     near: Tensor  # [views]
     far: Tensor  # [views]
-    neighbours: Tensor  # [views, n], the views that each is matched with
 
 
 class Boosted(NamedTuple):
@@ -30,7 +29,6 @@ class Boosted(NamedTuple):
 
     features: Tensor  # [views, channels, h, w] after the attention
     context: Tensor  # [views, context channels, h, w] before it, refined along from unit to unit
-    cnn: Tensor  # [views, cnn channels, h, w]
     inverse_depth_first: Tensor  # [views, 1, h, w] after the first layer alone
     inverse_depth: Tensor  # [views, 1, h, w]
     probability: Tensor  # [views, candidates, h, w], mean over the neighbours
@@ -42,21 +40,22 @@ class DepthProbabilityBoostingUnit(nn.Module):
 
     def __init__(self, config: IDESplatConfig, unit: DPBUConfig) -> None:
         super().__init__()
+        self.candidates = unit.candidates
         self.first = EpipolarAttention(unit, config.ffn_ratio, config.ffn_kernel)
         self.second = EpipolarAttention(unit, config.ffn_ratio, config.ffn_kernel)
 
     def boost(
-        self, features: Tensor, seed: Tensor, candidates: Tensor, cameras: Cameras
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Two layers over the same warp indices -> features, inverse depth of the first, of both, probability."""
+        self, features: Tensor, context: Tensor, seed: Tensor, candidates: Tensor, neighbours: Tensor, cameras: Cameras
+    ) -> Boosted:
+        """Run two layers over the same warp indices, starting from `features` and the inverse depth `seed`."""
         height, width = features.shape[2:]
         pixels = scale_intrinsics(cameras.intrinsics, height, width)
-        rows = nearest_pixels(candidates, pixels, cameras.extrinsics, cameras.neighbours)
+        rows = nearest_pixels(candidates, pixels, cameras.extrinsics, neighbours)
         features, prior = self.first(features, seed, rows, None)
         first_depth, _ = expectation(prior, candidates)
         features, posterior = self.second(features, first_depth, rows, prior)
         inverse_depth, probability = expectation(posterior, candidates)
-        return features, first_depth, inverse_depth, probability
+        return Boosted(features, context, first_depth, inverse_depth, probability, candidates)
 
 
 class CoarseUnit(DepthProbabilityBoostingUnit):
@@ -64,7 +63,6 @@ class CoarseUnit(DepthProbabilityBoostingUnit):
 
     def __init__(self, config: IDESplatConfig, unit: DPBUConfig) -> None:
         super().__init__(config, unit)
-        self.candidates = unit.candidates
         parts = (config.feature_channels, config.feature_channels, config.vit.dim, config.dpt.features)
         self.merge = Merge(parts, unit.channels)
 
@@ -76,22 +74,21 @@ class CoarseUnit(DepthProbabilityBoostingUnit):
         nearest, farthest = _per_view(1 / cameras.near), _per_view(1 / cameras.far)
         steps = torch.linspace(0, 1, self.candidates, dtype=context.dtype, device=context.device)[None, :, None, None]
         candidates = (farthest + steps * (nearest - farthest)).expand(-1, -1, *size)
-        features, first, inverse_depth, probability = self.boost(context, encoded.mono_disparity, candidates, cameras)
-        return Boosted(features, context, encoded.features_cnn_fine, first, inverse_depth, probability, candidates)
+        return self.boost(context, context, encoded.mono_disparity, candidates, encoded.neighbours, cameras)
 
 
 class FinerUnit(DepthProbabilityBoostingUnit):
     """The second or third unit: twice the resolution, candidates around the inverse depth of the unit before."""
 
-    def __init__(self, config: IDESplatConfig, unit: DPBUConfig, before: DPBUConfig, context: int, cnn: int) -> None:
-        """`before` is the previous unit; `context` and `cnn` are the channels that come from it."""
+    def __init__(self, config: IDESplatConfig, unit: DPBUConfig, before: DPBUConfig, context: int) -> None:
+        """`before` is the previous unit, `context` the channels of its context."""
         super().__init__(config, unit)
-        self.candidates = unit.candidates
         # The coarse unit's intervals, and by how much this unit's are narrower.
         self.intervals = (config.dpbus[0].candidates - 1) * unit.scale
         self.grow_features = Upsample2x(before.channels)
         self.grow_context = Upsample2x(context)
         # The CNN has a map of the second unit's resolution itself; only the third must grow it.
+        cnn = config.backbone_channels[1]
         self.grow_cnn = Upsample2x(cnn) if unit.scale > 2 else nn.Identity()
         cnn = cnn // 2 if unit.scale > 2 else cnn
         self.merge = Merge(
@@ -101,14 +98,12 @@ class FinerUnit(DepthProbabilityBoostingUnit):
     def forward(self, encoded: Encoded, before: Boosted, cameras: Cameras) -> Boosted:
         """Encoded views and the unit before -> features and inverse depth at twice its resolution."""
         context = self.grow_context(before.context)
-        cnn = self.grow_cnn(before.cnn)
         size = context.shape[2:]
-        at_size = [self.grow_features(before.features), context, cnn]
+        at_size = [self.grow_features(before.features), context, self.grow_cnn(encoded.features_cnn_fine)]
         features = self.merge(at_size, [encoded.features_mono, encoded.mono_out], *size)
         seed = resize(before.inverse_depth, *size)
         candidates = self.candidates_around(seed, cameras)
-        features, first, inverse_depth, probability = self.boost(features, seed, candidates, cameras)
-        return Boosted(features, context, cnn, first, inverse_depth, probability, candidates)
+        return self.boost(features, context, seed, candidates, encoded.neighbours, cameras)
 
     def candidates_around(self, seed: Tensor, cameras: Cameras) -> Tensor:
         """Candidates [views, candidates, h, w], evenly spaced around the seed within the cameras' range."""

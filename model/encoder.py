@@ -9,6 +9,7 @@ from .backbone import Backbone
 from .config import IDESplatConfig
 from .dinov2 import DinoV2
 from .dpt import DPTHead
+from .geometry import nearest_views
 from .layers import resize
 from .mv_transformer import MultiViewTransformer
 
@@ -19,6 +20,7 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 class Encoded(NamedTuple):
     """The encoder's maps; h and w are the image's size over the feature stride."""
 
+    neighbours: Tensor  # [views, n], the views that each is matched with
     features_cnn: Tensor  # [views, feature channels, h, w]
     features_cnn_fine: Tensor  # [views, cnn channels, 2h, 2w]
     features_mv: Tensor  # [views, feature channels, h, w]
@@ -40,8 +42,9 @@ class Encoder(nn.Module):
         self.vit = DinoV2(config.vit)
         self.dpt = DPTHead(config.vit.dim, config.vit.patch, config.dpt)
 
-    def forward(self, images: Tensor, neighbours: Tensor) -> Encoded:
-        """Images [views, 3, H, W] in [0, 1], neighbours [views, n] -> the encoder's maps."""
+    def forward(self, images: Tensor, extrinsics: Tensor) -> Encoded:
+        """Images [views, 3, H, W] in [0, 1], extrinsics [views, 4, 4] -> the encoder's maps."""
+        neighbours = nearest_views(extrinsics, self.config.neighbours)
         images = normalise(images)
         cnn, cnn_fine = self.backbone(images)
         mv = self.transformer(cnn, neighbours)
@@ -52,7 +55,7 @@ class Encoder(nn.Module):
         mono_out = self.dpt.features(maps)
         size = cnn.shape[2:]
         disparity = resize(self.dpt.disparity(mono_out, rows, columns), *size)
-        return Encoded(cnn, cnn_fine, mv, resize(maps[-1], *size), mono_out, disparity)
+        return Encoded(neighbours, cnn, cnn_fine, mv, resize(maps[-1], *size), mono_out, disparity)
 
 
 def normalise(images: Tensor) -> Tensor:

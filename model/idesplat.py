@@ -6,7 +6,6 @@ from .config import IDESplatConfig
 from .dpbu import Boosted, Cameras, CoarseUnit, FinerUnit
 from .encoder import Encoded, Encoder
 from .gaussian_head import GaussianStage, Predicted
-from .geometry import nearest_views
 
 
 class IDESplat(nn.Module):
@@ -21,11 +20,10 @@ class IDESplat(nn.Module):
         super().__init__()
         self.config = config
         first, second, third = config.dpbus
-        cnn = config.backbone_channels[1]
         self.encoder = Encoder(config)
         self.dpbu1 = CoarseUnit(config, first)
-        self.dpbu2 = FinerUnit(config, second, first, context=first.channels, cnn=cnn)
-        self.dpbu3 = FinerUnit(config, third, second, context=first.channels // 2, cnn=cnn)
+        self.dpbu2 = FinerUnit(config, second, first, context=first.channels)
+        self.dpbu3 = FinerUnit(config, third, second, context=first.channels // 2)
         self.gaussians = GaussianStage(config)
 
     def forward(self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor, near: Tensor, far: Tensor) -> Predicted:
@@ -42,9 +40,8 @@ class IDESplat(nn.Module):
         self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor, near: Tensor, far: Tensor
     ) -> tuple[Encoded, Boosted, Boosted, Boosted, Predicted]:
         """What each stage yields, in order, for parity and for training with every stage supervised."""
-        neighbours = nearest_views(extrinsics, self.config.neighbours)
-        cameras = Cameras(extrinsics, intrinsics, near, far, neighbours)
-        encoded = self.encoder(images, neighbours)
+        cameras = Cameras(extrinsics, intrinsics, near, far)
+        encoded = self.encoder(images, extrinsics)
         first = self.dpbu1(encoded, cameras)
         second = self.dpbu2(encoded, first, cameras)
         third = self.dpbu3(encoded, second, cameras)
