@@ -1,1 +1,1 @@
-
+"""From a checkpoint to ONNX graphs that any runtime can load, checked against PyTorch before they are handed out."""

@@ -7,13 +7,36 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from .cameras import Camera, read_cameras
+    from .errors import InputError
+    from .gaussians import Gaussians
+    from .ply import read_ply, write_ply
     from .rasterizer import rasterize
+    from .runner import Prediction, Runner
 
 _MODULE_OF = {
+    "Camera": "cameras",
+    "Gaussians": "gaussians",
+    "InputError": "errors",
+    "Prediction": "runner",
+    "Runner": "runner",
     "rasterize": "rasterizer",
+    "read_cameras": "cameras",
+    "read_ply": "ply",
+    "write_ply": "ply",
 }
 
-__all__ = ["rasterize"]
+__all__ = [
+    "Camera",
+    "Gaussians",
+    "InputError",
+    "Prediction",
+    "Runner",
+    "rasterize",
+    "read_cameras",
+    "read_ply",
+    "write_ply",
+]
 
 
 def __getattr__(name: str) -> object:

@@ -28,6 +28,8 @@ def replacing(path: Path) -> Iterator[Path]:
         yield temporary
         temporary.chmod(0o666 & ~_umask())
         temporary.replace(path)
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror}; choose a file on a disk with room for it") from None
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -39,6 +41,15 @@ def make_folder(path: Path) -> Path:
     except OSError as error:
         raise InputError(f"cannot create the folder {path}: {error.strerror}; choose another output folder") from None
     return Path(path)
+
+
+def check_writable(folder: Path) -> None:
+    """Raise InputError unless files can be written into an existing folder; to be asked before long work."""
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(f"cannot write into {folder}: {error.strerror}; choose a folder that exists") from None
 
 
 def _umask() -> int:

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 
-from .errors import InputError
 from .files import replacing
 
 NEAREST_SHARE, FARTHEST_SHARE = 98, 2  # percentiles of inverse depth that get the ends of the colour map
@@ -45,8 +44,5 @@ def _save(path: Path, bgr: np.ndarray) -> None:
     import cv2  # here, so that a command can say what it does without loading OpenCV
 
     _, encoded = cv2.imencode(".png", bgr)
-    try:
-        with replacing(path) as temporary:
-            temporary.write_bytes(encoded.data)
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror}; choose a file on a disk with room for it") from None
+    with replacing(path) as temporary:
+        temporary.write_bytes(encoded.data)

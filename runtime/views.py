@@ -106,8 +106,10 @@ def choose_views(extrinsics: np.ndarray, count: int) -> list[int]:
     return sorted(chosen)
 
 
-def prepare(pairs: Sequence[tuple[Path, Camera]], count: int | None, height: int, width: int) -> Views:
-    """Read the pictures (only `count` well chosen ones, if given), undistort them and bring them to height x width.
+def prepare(pairs: Sequence[tuple[Path | np.ndarray, Camera]], count: int | None, height: int, width: int) -> Views:
+    """Take the pictures (only `count` well chosen ones, if given), undistort them and bring them to height x width.
+
+    A picture is a file, or RGB [h, w, 3] in uint8, and is known by its camera's name.
 
     Raises InputError for fewer than two views, two cameras at the same pose, cameras without any baseline, a picture
     that cannot be read or has another size than its camera.
@@ -120,16 +122,16 @@ def prepare(pairs: Sequence[tuple[Path, Camera]], count: int | None, height: int
     extrinsics = np.stack([camera.extrinsics for _, camera in pairs])  # [views, 4, 4]
     _check_distinct(extrinsics, [camera.name for _, camera in pairs])
     cameras, images, intrinsics = [], [], []
-    for path, camera in pairs:
-        image = load_image(path)
-        with located(str(path)):
+    for picture, camera in pairs:
+        image = picture if isinstance(picture, np.ndarray) else load_image(picture)
+        with located(camera.name):
             camera = resized(camera, image.shape[1], image.shape[0])
         image, camera = undistort(image, camera)
         pixels, normalised = fit(image, camera.K, height, width)
         cameras.append(camera)
         images.append(pixels)
         intrinsics.append(normalised)
-    names = [path.name for path, _ in pairs]
+    names = [_path(camera.name).name for _, camera in pairs]
     return Views(names, np.stack(images), extrinsics.astype(np.float32), np.stack(intrinsics), cameras)
 
 

@@ -1,0 +1,205 @@
+"""The command idesplat-export: a checkpoint to ONNX, verified."""
+
+import hashlib
+import shutil
+import sys
+import tempfile
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ..runtime.bundle import MANIFEST_NAME, Description, StageFile, write_manifest
+from ..runtime.errors import InputError, exit_on_input_error
+from ..runtime.files import check_writable, make_folder, replacing
+
+if TYPE_CHECKING:
+    import onnx
+
+    from ..model.idesplat import IDESplat
+    from .exporter import Fixed
+    from .verify import Parity
+
+PARITY_BREACH = 1
+
+
+@exit_on_input_error
+def export(
+    checkpoint: Annotated[
+        Path, typer.Argument(help="Released checkpoint: .ckpt, .pth or .safetensors.", show_default=False)
+    ],
+    out: Annotated[Path | None, typer.Argument(help="The .onnx to write.", show_default=False)] = None,
+    preset: Annotated[
+        str | None, typer.Option(help="What the file was trained as, where its name does not say.")
+    ] = None,
+    staged: Annotated[Path | None, typer.Option(help="Folder for one graph a stage, with a manifest.")] = None,
+    views: Annotated[int | None, typer.Option(help="Bake in the number of views.", min=2)] = None,
+    size: Annotated[str | None, typer.Option(help="Bake in the image size, such as 256x256.")] = None,
+) -> None:
+    """Write a checkpoint as a standard ONNX graph (opset 20), and prove that it computes the same.
+
+    Views, height and width stay dynamic unless fixed by --views and --size.
+    """
+    _check_targets(out, staged)
+    from ..model.checkpoint import CheckpointError
+    from .exporter import Fixed
+
+    try:
+        model, name = _load(checkpoint, preset)
+    except CheckpointError as error:
+        raise InputError(str(error)) from None
+    fixed = Fixed(views, _parse_size(size, model.config.size_multiple) if size else None)
+    description = _describe(model, name, checkpoint, fixed)
+    if not _export(model, description, fixed, out, staged):
+        print("error: the graph departs from the network (see the table); nothing was written", file=sys.stderr)
+        raise SystemExit(PARITY_BREACH)
+
+
+def main() -> None:
+    """Entry point of idesplat-export."""
+    typer.run(export)
+
+
+def _check_targets(out: Path | None, staged: Path | None) -> None:
+    """Find out before minutes of work whether the results can be written."""
+    if out is None and staged is None:
+        raise InputError("nothing to write: give OUT.onnx, or --staged DIR, or both")
+    if out is not None:
+        if out.suffix != ".onnx":
+            raise InputError(f"{out}: the output must end in .onnx")
+        check_writable(out.parent)
+    if staged is not None:
+        if staged.exists() and not staged.is_dir():
+            raise InputError(f"--staged {staged}: is a file, expected a folder")
+        if staged.is_dir() and any(staged.iterdir()) and not (staged / MANIFEST_NAME).is_file():
+            raise InputError(f"--staged {staged}: holds other files; choose an empty or new folder")
+        check_writable(make_folder(staged.parent))
+
+
+def _parse_size(text: str, multiple: int) -> tuple[int, int]:
+    """`HEIGHTxWIDTH`, multiples of what the network needs."""
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(part.isdigit() for part in parts):
+        raise InputError(f"--size {text}: expected HEIGHTxWIDTH, such as 256x256")
+    height, width = int(parts[0]), int(parts[1])
+    if height % multiple or width % multiple or min(height, width) < 2 * multiple:
+        raise InputError(f"--size {text}: height and width must be multiples of {multiple} from {2 * multiple}")
+    return height, width
+
+
+def _load(checkpoint: Path, preset: str | None) -> "tuple[IDESplat, str]":
+    """The network with the file's weights, and the preset's name."""
+    from ..model.checkpoint import fill, infer_preset, read_state_dict
+    from ..model.config import PRESETS
+    from ..model.idesplat import IDESplat
+
+    if preset is not None and preset not in PRESETS:
+        raise InputError(f"--preset {preset}: unknown; choose one of {', '.join(PRESETS)}")
+    print(f"reading {checkpoint}")
+    tensors = read_state_dict(checkpoint)
+    name = preset or infer_preset(checkpoint, tensors)
+    model = IDESplat(PRESETS[name])
+    fill(model, tensors, checkpoint)
+    count = sum(parameter.numel() for parameter in model.parameters())
+    print(f"preset {name}, {count:,} parameters")
+    return model.eval(), name
+
+
+def _describe(model: "IDESplat", preset: str, checkpoint: Path, fixed: "Fixed") -> Description:
+    config = model.config
+    height, width = fixed.size or (config.height, config.width)
+    with checkpoint.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    return Description(
+        preset=preset,
+        height=height,
+        width=width,
+        size_multiple=config.size_multiple,
+        fixed_size=fixed.size is not None,
+        fixed_views=fixed.views or 0,
+        near=config.near,
+        far=config.far,
+        sh_degree=config.sh_degree,
+        checkpoint=checkpoint.name,
+        checkpoint_sha256=digest,
+        version=version("idesplat"),
+    )
+
+
+def _export(model: "IDESplat", description: Description, fixed: "Fixed", out: Path | None, staged: Path | None) -> bool:
+    """Trace, verify and write; False and nothing written if the graph departs from the network."""
+    import onnx
+    from rich.console import Console
+
+    from .exporter import fused_graph, trace
+    from .stages import NamedTensors
+    from .verify import verify
+
+    console = Console(stderr=True)
+    network = NamedTensors(model)
+    with console.status("tracing the network (a minute or so)"):
+        traced = trace(network, description.near, description.far, description.size_multiple, fixed)
+        fused = fused_graph(traced, description)
+        onnx.checker.check_model(fused, full_check=True)
+        content = fused.SerializeToString()
+    print(f"traced: {len(fused.graph.node)} nodes, opset 20, {len(content) / 1e6:.0f} MB")
+    rows = []
+    with console.status("verifying against PyTorch") as status:
+        for row in verify(network, traced, content, description, fixed):
+            rows.append(row)
+            status.update(f"verifying against PyTorch: {row.case}, {row.stage}")
+    _print_table(rows)
+    if not all(row.passed for row in rows):
+        return False
+    if out is not None:
+        with replacing(out) as temporary:
+            temporary.write_bytes(content)
+        print(f"wrote {out}\nrun it with: idesplat-infer --model {out} --images ... --cameras ... --out scene.ply")
+    if staged is not None:
+        _write_stages(traced, description, staged)
+        print(
+            f"wrote {staged}\nrun it with: idesplat-infer --model {staged} --images ... --cameras ... --out scene.ply"
+        )
+    return True
+
+
+def _write_stages(traced: "onnx.ModelProto", description: Description, staged: Path) -> None:
+    """One graph a stage and the manifest, in a folder that appears whole."""
+    import onnx
+
+    from .exporter import stage_graph
+    from .stages import IDESPLAT_STAGES
+
+    temporary = Path(tempfile.mkdtemp(prefix=f".{staged.name}.", dir=staged.parent))
+    try:
+        files = []
+        for stage in IDESPLAT_STAGES:
+            graph = stage_graph(traced, stage, description)
+            onnx.checker.check_model(graph, full_check=True)
+            inputs = [entry.name for entry in graph.graph.input]
+            files.append(StageFile(stage.name, f"{stage.name}.onnx", inputs, list(stage.outputs)))
+            (temporary / files[-1].file).write_bytes(graph.SerializeToString())
+        write_manifest(temporary, files)
+        temporary.chmod(0o755)
+        if staged.exists():
+            shutil.rmtree(staged)
+        temporary.rename(staged)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _print_table(rows: "list[Parity]") -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title="ONNX Runtime against PyTorch, in standard deviations of each tensor")
+    for column in ("case", "stage", "tensor"):
+        table.add_column(column)
+    for column in ("largest", "median", "tolerance"):
+        table.add_column(column, justify="right")
+    table.add_column("verdict")
+    for row in rows:
+        numbers = (f"{value:.1e}" for value in (row.largest, row.median, row.tolerance))
+        table.add_row(row.case, row.stage, row.tensor, *numbers, "ok" if row.passed else "DEPARTS")
+    Console(width=None if sys.stdout.isatty() else 120).print(table)

@@ -1,0 +1,118 @@
+"""Freeze a network: one trace to one ONNX graph, from which the stages' graphs are cut."""
+
+import copy
+import logging
+import tempfile
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import onnx
+import torch
+
+from ..runtime.bundle import INPUTS, METADATA_KEY, OUTPUTS, Description
+from .optimize import simplify
+from .stages import NamedTensors, Stage, example_inputs
+
+OPSET = 20
+IR_VERSION = 10
+# Traced with views and sizes that no other number in the network equals; the graph is dynamic in all three.
+TRACE_VIEWS = 4
+TRACE_BLOCKS = (6, 8)
+DYNAMIC = {
+    "images": {0: "views", 2: "height", 3: "width"},
+    "extrinsics": {0: "views"},
+    "intrinsics": {0: "views"},
+    "near": {0: "views"},
+    "far": {0: "views"},
+    "depth": {0: "views", 1: "height", 2: "width"},
+    **{name: {0: "gaussians"} for name in OUTPUTS if name != "depth"},
+}
+PRODUCER = "idesplat"
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """Sizes to bake in; None leaves them to the user of the graph."""
+
+    views: int | None = None
+    size: tuple[int, int] | None = None
+
+
+def trace(network: NamedTensors, near: float, far: float, multiple: int, fixed: Fixed) -> onnx.ModelProto:
+    """Export the network with every stage boundary as an output.
+
+    torch.onnx's TorchScript path is used on purpose: with views, height and width dynamic, torch.export 2.13 spends
+    minutes reasoning about symbolic shapes even for a network of a tenth of the size.
+    """
+    views = fixed.views or TRACE_VIEWS
+    height, width = fixed.size or (TRACE_BLOCKS[0] * multiple, TRACE_BLOCKS[1] * multiple)
+    inputs = tuple(example_inputs(views, height, width, near, far).values())
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings(), torch.no_grad():
+        warnings.simplefilter("ignore")  # deprecation of the path, and tracing warnings on sizes fixed on purpose
+        logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+        path = Path(folder) / "traced.onnx"
+        axes = _dynamic_axes(network.names, fixed)
+        torch.onnx.export(
+            network,
+            inputs,
+            str(path),
+            dynamo=False,
+            opset_version=OPSET,
+            input_names=list(INPUTS),
+            output_names=list(network.names),
+            dynamic_axes=axes,
+        )
+        model = simplify(path)
+        shapes = {name: tuple(tensor.shape) for name, tensor in network.named(*inputs).items()}
+    _declare_shapes(model, shapes, axes)
+    return model
+
+
+def _dynamic_axes(names: Sequence[str], fixed: Fixed) -> dict[str, dict[int, str]]:
+    """Names of the dimensions that are not fixed; the tensors between stages have dimensions of their own."""
+    boundaries = {name: {0: "views", 2: f"{name}.height", 3: f"{name}.width"} for name in names if "." in name}
+    boundaries["encoder.neighbours"] = {0: "views", 1: "neighbours"}
+
+    def is_open(dimension: str) -> bool:
+        depends_on_views = dimension in ("views", "neighbours", "gaussians")
+        depends_on_size = dimension == "gaussians" or not depends_on_views
+        return (depends_on_views and not fixed.views) or (depends_on_size and not fixed.size)
+
+    axes = {**DYNAMIC, **boundaries}
+    return {name: {axis: dim for axis, dim in dims.items() if is_open(dim)} for name, dims in axes.items()}
+
+
+def _declare_shapes(
+    model: onnx.ModelProto, shapes: dict[str, tuple[int, ...]], axes: dict[str, dict[int, str]]
+) -> None:
+    """Give every output the shape that is known of it: the passes above replace names by ones of their own."""
+    for output in model.graph.output:
+        dims = [axes[output.name].get(axis, size) for axis, size in enumerate(shapes[output.name])]
+        element = output.type.tensor_type.elem_type
+        output.CopyFrom(onnx.helper.make_tensor_value_info(output.name, element, dims))
+
+
+def fused_graph(traced: onnx.ModelProto, description: Description) -> onnx.ModelProto:
+    """The traced graph with the network's own outputs alone."""
+    model = copy.deepcopy(traced)
+    outputs = [output for output in model.graph.output if output.name in OUTPUTS]
+    del model.graph.output[:]
+    model.graph.output.extend(sorted(outputs, key=lambda output: OUTPUTS.index(output.name)))
+    return _finished(model, description)
+
+
+def stage_graph(traced: onnx.ModelProto, stage: Stage, description: Description) -> onnx.ModelProto:
+    """One stage cut from the traced graph, between its named tensors."""
+    model = onnx.utils.Extractor(traced).extract_model(list(stage.inputs), list(stage.outputs))
+    return _finished(model, description)
+
+
+def _finished(model: onnx.ModelProto, description: Description) -> onnx.ModelProto:
+    model.ir_version = IR_VERSION
+    model.producer_name, model.producer_version = PRODUCER, description.version
+    model.doc_string = f"{description.preset} exported by idesplat {description.version}"
+    del model.metadata_props[:]
+    onnx.helper.set_model_props(model, {METADATA_KEY: description.to_json()})
+    return model

@@ -1,0 +1,218 @@
+"""The command idesplat-infer: photographs and cameras to a splat file, depth maps and views."""
+
+import json
+import sys
+import time
+from collections import Counter
+from dataclasses import asdict
+from pathlib import Path, PurePath
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from .errors import InputError, exit_on_input_error
+from .files import check_writable, make_folder, replacing
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from .runner import Prediction, Runner
+    from .views import Views
+
+DEFAULT_VIEWS = 2
+# Frames of the path that --render draws from the first view to the last.
+PATH_FRAMES = 24
+
+
+@exit_on_input_error
+def infer(
+    images: Annotated[list[Path], typer.Option(help="Folder, glob or files of photographs.", show_default=False)],
+    cameras: Annotated[Path, typer.Option(help="transforms.json, or this project's cameras JSON.", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Splat file to write (.ply).", show_default=False)],
+    model: Annotated[Path, typer.Option(help="A .onnx or staged folder of idesplat-export.", show_default=False)],
+    more_images: Annotated[list[Path] | None, typer.Argument(hidden=True)] = None,
+    views: Annotated[
+        int, typer.Option(help="How many photographs to use, the best placed ones.", min=2)
+    ] = DEFAULT_VIEWS,
+    size: Annotated[str | None, typer.Option(help="HEIGHTxWIDTH to work at instead of the trained size.")] = None,
+    near: Annotated[float | None, typer.Option(help="Nearest depth in scene units instead of the model's.")] = None,
+    far: Annotated[float | None, typer.Option(help="Farthest depth in scene units instead of the model's.")] = None,
+    provider: Annotated[str, typer.Option(help="ONNX Runtime execution provider, such as CPU or CUDA.")] = "CPU",
+    save_depth: Annotated[Path | None, typer.Option(help="Folder for depth maps (.png and metric .npz).")] = None,
+    render: Annotated[Path | None, typer.Option(help="Folder for views drawn from the result.")] = None,
+    timings: Annotated[bool, typer.Option("--timings", help="Print seconds by stage.")] = False,
+    json_path: Annotated[Path | None, typer.Option("--json", help="Write a summary as JSON.")] = None,
+) -> None:
+    """Turn posed photographs into a 3D Gaussian splat that every viewer opens."""
+    started = time.perf_counter()
+    _check_outputs(out, save_depth, render, json_path)
+    _check_range(near, far)
+    prepared, runner, taken = _load([*images, *(more_images or [])], cameras, model, provider, views, size)
+    prediction = _predict(prepared, runner, near, far)
+    written = _write(prediction, prepared, out, save_depth, render)
+    seconds = {"load": runner.load_seconds, **prediction.seconds, "total": time.perf_counter() - started}
+    if json_path is not None:
+        summary = _summary(prediction, prepared, runner, near, far, seconds, written)
+        with replacing(json_path) as temporary:
+            temporary.write_text(json.dumps(summary, indent=2) + "\n")
+        written.append(json_path)
+    if len(prepared.names) < taken:
+        print(f"{len(prepared.names)} of {taken} photographs used: {', '.join(prepared.names)} (--views for more)")
+    for path in written:
+        print(f"wrote {path}")
+    print(f"open {out} in any splat viewer (SuperSplat, for one), or draw it with")
+    print(f"    idesplat-render {out} --cameras {cameras} --out DIR")
+    if timings:
+        _print_timings(seconds)
+
+
+def main() -> None:
+    """Entry point of idesplat-infer."""
+    typer.run(infer)
+
+
+def _check_outputs(out: Path, save_depth: Path | None, render: Path | None, json_path: Path | None) -> None:
+    """Find out before the work whether the results can be written."""
+    if out.suffix != ".ply":
+        raise InputError(f"--out {out}: expected a file that ends in .ply")
+    for path in (out, json_path):
+        if path is not None:
+            if path.is_dir():
+                raise InputError(f"{path}: is a folder, expected a file to write")
+            check_writable(path.parent)
+    for folder in (save_depth, render):
+        if folder is not None:
+            check_writable(make_folder(folder))
+
+
+def _check_range(near: float | None, far: float | None) -> None:
+    """What can be said of --near and --far before the model's own range is known."""
+    for name, value in (("--near", near), ("--far", far)):
+        if value is not None and not 0 < value < float("inf"):
+            raise InputError(f"{name} {value:g}: expected a positive depth in scene units")
+    if near is not None and far is not None and near >= far:
+        raise InputError(f"--near {near:g} and --far {far:g}: expected near < far")
+
+
+def _load(
+    given: list[Path], camera_file: Path, model: Path, provider: str, views: int, size: str | None
+) -> "tuple[Views, Runner, int]":
+    """Read photographs, cameras and model; the chosen views, and how many photographs there were."""
+    from .cameras import read_cameras
+    from .images import find_images
+    from .runner import Runner
+    from .views import match, prepare
+
+    pairs = match(find_images(given), read_cameras(camera_file))
+    runner = Runner(model, provider)
+    height, width = _parse_size(size) if size else runner.size_for([camera for _, camera in pairs])
+    count = min(runner.description.fixed_views or views, len(pairs))
+    runner.check_size(max(count, DEFAULT_VIEWS), height, width)
+    return prepare(pairs, count if len(pairs) > count else None, height, width), runner, len(pairs)
+
+
+def _parse_size(text: str) -> tuple[int, int]:
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(part.isdigit() for part in parts):
+        raise InputError(f"--size {text}: expected HEIGHTxWIDTH, such as 256x256")
+    return int(parts[0]), int(parts[1])
+
+
+def _predict(views: "Views", runner: "Runner", near: float | None, far: float | None) -> "Prediction":
+    from rich.console import Console
+
+    with Console(stderr=True).status("predicting depth and Gaussians"):
+        return runner.predict_arrays(views.images, views.extrinsics, views.intrinsics, near, far)
+
+
+def _write(
+    prediction: "Prediction", views: "Views", out: Path, save_depth: Path | None, render: Path | None
+) -> list[Path]:
+    """Write the splat file and what else was asked for; the paths written."""
+    from .ply import write_ply
+
+    stems = _stems(views.names)
+    write_ply(out, prediction.gaussians)
+    written = [out]
+    if save_depth is not None:
+        written += _write_depth(prediction.depth, stems, save_depth)
+    if render is not None:
+        written += _write_renders(prediction, views, stems, render)
+    return written
+
+
+def _stems(names: list[str]) -> list[str]:
+    """File names without suffix, with the view's number in front where two are the same."""
+    stems = [PurePath(name).stem for name in names]
+    counts = Counter(stems)
+    return [stem if counts[stem] == 1 else f"{index}-{stem}" for index, stem in enumerate(stems)]
+
+
+def _write_depth(depth: "np.ndarray", stems: list[str], folder: Path) -> list[Path]:
+    """A colour-mapped PNG and a metric .npz (key `depth`) for each view of depth [views, height, width]."""
+    import numpy as np
+
+    from .images_out import save_depth_png
+
+    written = []
+    for stem, values in zip(stems, depth, strict=True):
+        picture, metric = folder / f"{stem}.png", folder / f"{stem}.npz"
+        save_depth_png(picture, values)
+        with replacing(metric) as temporary:
+            np.savez_compressed(temporary, depth=values)
+        written += [picture, metric]
+    return written
+
+
+def _write_renders(prediction: "Prediction", views: "Views", stems: list[str], folder: Path) -> list[Path]:
+    """The scene from the input views, and along a smooth path from the first to the last."""
+    import numpy as np
+    from rich.console import Console
+    from rich.progress import track
+
+    from .images_out import save_png
+    from .paths import interpolate_extrinsics
+    from .render import draw_view
+
+    height, width = prediction.depth.shape[1:]
+    K = views.intrinsics.astype(np.float64) * np.array([width, height, 1.0])[:, None]  # [views, 3, 3]
+    shots = [(f"view-{stem}.png", pose, k) for stem, pose, k in zip(stems, views.extrinsics, K, strict=True)]
+    path = interpolate_extrinsics(views.extrinsics, PATH_FRAMES)
+    shots += [(f"path-{index:03d}.png", pose, K.mean(axis=0)) for index, pose in enumerate(path)]
+    written = []
+    console = Console(stderr=True)
+    for name, pose, k in track(shots, "drawing views", console=console, disable=not sys.stderr.isatty()):
+        save_png(folder / name, draw_view(prediction.gaussians, pose, k, width, height).rgb)
+        written.append(folder / name)
+    return written
+
+
+def _summary(
+    prediction: "Prediction",
+    views: "Views",
+    runner: "Runner",
+    near: float | None,
+    far: float | None,
+    seconds: dict[str, float],
+    written: list[Path],
+) -> dict[str, Any]:
+    import numpy as np
+
+    own, depth = runner.description, prediction.depth
+    return {
+        "model": {"path": str(runner.path), **asdict(own)},
+        "views": views.names,
+        "height": depth.shape[1],
+        "width": depth.shape[2],
+        "near": own.near if near is None else near,
+        "far": own.far if far is None else far,
+        "gaussians": len(prediction.gaussians),
+        "depth": dict(zip(("smallest", "median", "largest"), np.percentile(depth, (0, 50, 100)).tolist(), strict=True)),
+        "seconds": seconds,
+        "files": [str(path) for path in written],
+    }
+
+
+def _print_timings(seconds: dict[str, float]) -> None:
+    for name, value in seconds.items():
+        print(f"{name:>10} {value:8.2f} s")
