@@ -24,7 +24,7 @@ class ResidualBlock(nn.Module):
 
 
 class Backbone(nn.Module):
-    """Images to feature maps at `stride` and at half of it."""
+    """Images to feature maps at `stride`, at half of it, and at half the image's size."""
 
     def __init__(self, channels: tuple[int, int, int], out_channels: int, stride: int) -> None:
         super().__init__()
@@ -39,8 +39,11 @@ class Backbone(nn.Module):
     def _layer(in_channels: int, channels: int, stride: int) -> nn.Sequential:
         return nn.Sequential(ResidualBlock(in_channels, channels, stride), ResidualBlock(channels, channels, 1))
 
-    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Normalised images [views, 3, H, W] -> [views, out_channels, h, w] and the finer [views, middle, 2h, 2w]."""
-        x = F.relu(F.instance_norm(self.conv1(images)))
-        finer = self.layer2(self.layer1(x))
-        return self.conv2(self.layer3(finer)), finer
+    def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Normalised images [views, 3, H, W] -> three maps, coarsest first.
+
+        [views, out_channels, h, w], [views, middle, 2h, 2w] and [views, fine, H / 2, W / 2].
+        """
+        finest = self.layer1(F.relu(F.instance_norm(self.conv1(images))))
+        finer = self.layer2(finest)
+        return self.conv2(self.layer3(finer)), finer, finest

@@ -1,5 +1,6 @@
 """Strict loading of released checkpoints: every key and every shape, or an error that names what differs."""
 
+import hashlib
 import pickle
 import re
 from collections.abc import Callable
@@ -8,12 +9,18 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from .config import PRESETS, IDESplatConfig
+from .config import PRESETS, DepthSplatConfig, IDESplatConfig
 from .idesplat import IDESplat
+from .networks import Network, build
 
 # Where a state dict may be nested in a file, and the prefix of the encoder's keys in it.
 CONTAINERS = ("state_dict", "model")
 PREFIX = "encoder."
+# The prefix that the depth-only checkpoints leave away, and a key's beginning by which they are known.
+DEPTH_PREFIX = "depth_predictor."
+DEPTH_ONLY = "pretrained."
+# Released files name the first digits of their SHA-256.
+NAMED_HASH = re.compile(r"-([0-9a-f]{8})\.pth$")
 # Keys an error message shows before it only counts.
 SHOWN = 4
 
@@ -53,7 +60,21 @@ def read_state_dict(path: Path) -> dict[str, Tensor]:
         tensors = {key.removeprefix(PREFIX): value for key, value in tensors.items() if key.startswith(PREFIX)}
     if not tensors:
         raise CheckpointError(f"{path}: holds no tensors, expected a state dict; is it a checkpoint?")
+    if any(key.startswith(DEPTH_ONLY) for key in tensors):
+        tensors = {DEPTH_PREFIX + key: value for key, value in tensors.items()}
     return tensors
+
+
+def name_hash_warning(path: Path) -> str | None:
+    """A warning, if the file's name holds the beginning of its SHA-256, as released ones do, and it does not match."""
+    named = NAMED_HASH.search(path.name)
+    if not named:
+        return None
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    if digest.startswith(named[1]):
+        return None
+    return f"{path}: its name says that its SHA-256 begins with {named[1]}, but it begins with {digest[:8]}"
 
 
 def _read_safetensors(path: Path) -> object:
@@ -93,7 +114,10 @@ def infer_preset(path: Path, tensors: dict[str, Tensor]) -> str:
     Raises CheckpointError if no preset fits, or several do and the name does not decide.
     """
     fitting = fitting_presets(tensors)
-    named = [name for name in fitting if name.rsplit("-", 1)[-1] in path.name.lower()]
+    words = _words(path.name)
+    # What all of the fitting presets' names have in common says nothing about which of them it is.
+    common = set.intersection(*map(_words, fitting)) if fitting else set()
+    named = [name for name in fitting if _words(name) - common <= words]
     if len(named or fitting) == 1:
         return (named or fitting)[0]
     if not fitting:
@@ -109,7 +133,11 @@ def infer_preset(path: Path, tensors: dict[str, Tensor]) -> str:
     )
 
 
-def fill(model: IDESplat, tensors: dict[str, Tensor], path: Path) -> None:
+def _words(name: str) -> set[str]:
+    return set(re.split(r"[^a-z0-9]+", name.lower()))
+
+
+def fill(model: Network, tensors: dict[str, Tensor], path: Path) -> None:
     """Load released tensors into a model; raises CheckpointError naming the first keys that differ."""
     renamed = rename_released(tensors)
     own = model.state_dict()
@@ -121,9 +149,9 @@ def fill(model: IDESplat, tensors: dict[str, Tensor], path: Path) -> None:
     model.load_state_dict({key: value.reshape(own[key].shape) for key, value in renamed.items()})
 
 
-def _expected_shapes(config: IDESplatConfig) -> dict[str, tuple[int, ...]]:
+def _expected_shapes(config: IDESplatConfig | DepthSplatConfig) -> dict[str, tuple[int, ...]]:
     with torch.device("meta"):
-        return {key: tuple(value.shape) for key, value in IDESplat(config).state_dict().items()}
+        return {key: tuple(value.shape) for key, value in build(config).state_dict().items()}
 
 
 def _differences(expected: dict[str, tuple[int, ...]], tensors: dict[str, Tensor]) -> list[str]:
@@ -145,11 +173,19 @@ def _shown(differences: list[str]) -> str:
 
 def rename_released(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     """Tensors by this project's names; those that no network uses are left out, other unknown keys keep their name."""
-    return {rename_key(key): value for key, value in tensors.items() if not UNUSED.search(key)}
+    renamed = {rename_key(key): value for key, value in tensors.items() if not UNUSED.search(key)}
+    two_scales = any(key.startswith("depth2.") for key in renamed)
+    stages = {"last_depth": "depth2"} if two_scales else {"last_depth": "depth", "depth1": "depth"}
+    return {_in_stage(key, stages): value for key, value in renamed.items()}
+
+
+def _in_stage(key: str, stages: dict[str, str]) -> str:
+    stage, dot, rest = key.partition(".")
+    return stages.get(stage, stage) + dot + rest
 
 
 def rename_key(key: str) -> str:
-    """A released key by this project's name."""
+    """A released key by this project's name; which of DepthSplat's scales comes last, one key alone does not say."""
     for pattern, replacement in RENAMES:
         key = pattern.sub(replacement, key)
     return key
@@ -180,6 +216,11 @@ def _unet_output(match: re.Match[str]) -> str:
     return f"upsamples.{block // 2}." if rest.endswith("conv.") else f"up_attention.{block}."
 
 
+def _depth_stage(match: re.Match[str]) -> str:
+    """Scales are numbered from zero, stages from one."""
+    return f"depth{int(match[1]) + 1}"
+
+
 def _counted_down(name: str) -> Callable[[re.Match[str]], str]:
     """Numbering from one -> from zero."""
     return lambda match: f"{name}.{int(match[1]) - 1}."
@@ -206,6 +247,16 @@ _RULES: list[tuple[str, Replacement]] = [
     (r"^depth_predictor\.gaussian_fuse\.", "gaussians.fuse."),
     (r"^depth_predictor\.gaussian_layers\.", "gaussians.focus.layers."),
     (r"^depth_predictor\.gaussian_conv\.", "gaussians.expand."),
+    (r"^depth_predictor\.pretrained\.", "encoder.vit."),
+    (r"^depth_predictor\.(mv|mono)_pyramid\.stages\.1\.", r"depth2.grow_\1."),
+    (r"^depth_predictor\.regressor\.(\d)\.", lambda match: f"{_depth_stage(match)}.regulariser."),
+    (r"^depth_predictor\.regressor_residual\.(\d)\.", lambda match: f"{_depth_stage(match)}.shortcut."),
+    (r"^depth_predictor\.depth_head\.(\d)\.0\.", lambda match: f"{_depth_stage(match)}.head1."),
+    (r"^depth_predictor\.depth_head\.(\d)\.2\.", lambda match: f"{_depth_stage(match)}.head2."),
+    (r"^depth_predictor\.upsampler\.", "last_depth.upsampler."),
+    (r"^feature_upsampler\.", "gaussians.upsampler."),
+    (r"^gaussian_regressor\.0\.", "gaussians.regressor1."),
+    (r"^gaussian_regressor\.2\.", "gaussians.regressor2."),
     (r"^gaussian_head\.0\.", "gaussians.head1."),
     (r"^gaussian_head\.2\.", "gaussians.head2."),
     # backbone and multi-view transformer
@@ -226,6 +277,10 @@ _RULES: list[tuple[str, Replacement]] = [
     (r"scratch\.refinenet(\d)\.", _counted_down("fusions")),
     (r"\.resConfUnit1\.", ".lateral."),
     (r"\.resConfUnit2\.", ".unit."),
+    (r"\.concat_projects\.", ".merges."),
+    (r"scratch\.output_conv\.0\.", "residual1."),
+    (r"scratch\.output_conv\.2\.", "residual2."),
+    (r"scratch\.output_conv\.4\.", "residual3."),
     (r"scratch\.output_conv1\.", "disparity1."),
     (r"scratch\.output_conv2\.0\.", "disparity2."),
     (r"scratch\.output_conv2\.2\.", "disparity3."),

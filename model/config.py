@@ -1,6 +1,6 @@
 """Every size of the networks, as frozen configurations, and the presets of the released checkpoints."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,26 @@ class FocusConfig:
 
 
 @dataclass(frozen=True)
-class IDESplatConfig:
-    """IDESplat. The defaults are the released RealEstate10K network; the other presets differ as `PRESETS` says."""
+class DepthScaleConfig:
+    """One scale of DepthSplat's depth: its candidates, and the U-Net that regularises their costs."""
+
+    candidates: int
+    unet: UNetConfig
+
+
+@dataclass(frozen=True)
+class UpsamplerConfig:
+    """DepthSplat's two DPT heads, which bring depth and features to image size."""
+
+    # Channels of the four reassembled maps, finest first.
+    channels: tuple[int, int, int, int] = (48, 96, 192, 384)
+    depth_features: int = 32
+    features: int = 64
+
+
+@dataclass(frozen=True)
+class EncoderConfig:
+    """What both networks have: the encoder, the Gaussians' parameters, and the cameras and images of the training."""
 
     # Image size over the coarsest feature map's, 4 or 8.
     feature_stride: int = 4
@@ -75,17 +93,6 @@ class IDESplatConfig:
     # The multi-view transformer attends within this many windows a side.
     attention_splits: int = 2
     vit: ViTConfig = ViTConfig()
-    dpt: DPTConfig = DPTConfig()
-    dpbus: tuple[DPBUConfig, DPBUConfig, DPBUConfig] = (
-        DPBUConfig(channels=256, candidates=257, scale=1, unet=UNetConfig(channels=32, levels=3)),
-        DPBUConfig(channels=64, candidates=129, scale=2, unet=UNetConfig(channels=16, levels=4)),
-        DPBUConfig(channels=32, candidates=65, scale=4, unet=UNetConfig(channels=8, levels=5)),
-    )
-    residual_unet: UNetConfig = UNetConfig(channels=32, levels=5)
-    # Expansion and depthwise kernel of the feed-forward layers after epipolar and window attention.
-    ffn_ratio: int = 2
-    ffn_kernel: int = 5
-    focus: FocusConfig = FocusConfig()
     # Each view is matched with this many of its nearest views; with three views or fewer, with all others.
     neighbours: int = 2
     sh_degree: int = 2
@@ -99,18 +106,105 @@ class IDESplatConfig:
     width: int = 256
 
     @property
-    def size_multiple(self) -> int:
-        """Height and width must be multiples of this: every U-Net and the attention windows halve evenly."""
-        return max(self.feature_stride // unit.scale * 2 ** (unit.unet.levels - 1) for unit in self.dpbus)
-
-    @property
     def sh_coefficients(self) -> int:
         """Spherical-harmonic coefficients a colour channel."""
         return (self.sh_degree + 1) ** 2
 
 
-PRESETS: dict[str, IDESplatConfig] = {
+@dataclass(frozen=True)
+class IDESplatConfig(EncoderConfig):
+    """IDESplat. The defaults are the released RealEstate10K network; the other presets differ as `PRESETS` says."""
+
+    dpt: DPTConfig = DPTConfig()
+    dpbus: tuple[DPBUConfig, DPBUConfig, DPBUConfig] = (
+        DPBUConfig(channels=256, candidates=257, scale=1, unet=UNetConfig(channels=32, levels=3)),
+        DPBUConfig(channels=64, candidates=129, scale=2, unet=UNetConfig(channels=16, levels=4)),
+        DPBUConfig(channels=32, candidates=65, scale=4, unet=UNetConfig(channels=8, levels=5)),
+    )
+    residual_unet: UNetConfig = UNetConfig(channels=32, levels=5)
+    # Expansion and depthwise kernel of the feed-forward layers after epipolar and window attention.
+    ffn_ratio: int = 2
+    ffn_kernel: int = 5
+    focus: FocusConfig = FocusConfig()
+
+    @property
+    def size_multiple(self) -> int:
+        """Height and width must be multiples of this: every U-Net and the attention windows halve evenly."""
+        return max(self.feature_stride // unit.scale * 2 ** (unit.unet.levels - 1) for unit in self.dpbus)
+
+
+@dataclass(frozen=True)
+class DepthSplatConfig(EncoderConfig):
+    """DepthSplat. The defaults are the released small RealEstate10K network, of one scale."""
+
+    # One scale, or two: the second at twice the resolution, around the inverse depth of the first.
+    scales: tuple[DepthScaleConfig, ...] = (
+        DepthScaleConfig(candidates=128, unet=UNetConfig(channels=128, levels=3, heads=4)),
+    )
+    upsampler: UpsamplerConfig = UpsamplerConfig()
+    # Channels of the two convolutions before the Gaussian head.
+    regressor_channels: int = 64
+    # The depth-only checkpoints have no Gaussian stage.
+    gaussians: bool = True
+
+    @property
+    def depth_stride(self) -> int:
+        """Image size over that of the last scale's inverse depth."""
+        return self.feature_stride // 2 ** (len(self.scales) - 1)
+
+    @property
+    def size_multiple(self) -> int:
+        """Height and width must be multiples of this: every U-Net and the attention windows halve evenly."""
+        levels = (scale.unet.levels - 1 - index for index, scale in enumerate(self.scales))
+        return self.feature_stride * 2 ** max(levels)
+
+
+TWO_SCALES = (
+    DepthScaleConfig(candidates=128, unet=UNetConfig(channels=128, levels=3, heads=4)),
+    DepthScaleConfig(candidates=32, unet=UNetConfig(channels=64, levels=4, heads=2)),
+)
+VIT_BASE = ViTConfig(dim=768, heads=12)
+VIT_LARGE = ViTConfig(dim=1024, depth=24, heads=16, taps=(4, 11, 17, 23))
+UPSAMPLER_BASE = UpsamplerConfig(channels=(96, 192, 384, 768), depth_features=48, features=96)
+UPSAMPLER_LARGE = UpsamplerConfig(channels=(128, 256, 512, 1024), depth_features=64, features=128)
+
+_SMALL = DepthSplatConfig()
+_SMALL_8 = replace(_SMALL, feature_stride=8)
+_BASE = DepthSplatConfig(scales=TWO_SCALES, vit=VIT_BASE, upsampler=UPSAMPLER_BASE)
+_BASE_8 = replace(_BASE, feature_stride=8)
+_LARGE = DepthSplatConfig(scales=TWO_SCALES, vit=VIT_LARGE, upsampler=UPSAMPLER_LARGE)
+
+PRESETS: dict[str, IDESplatConfig | DepthSplatConfig] = {
     "idesplat-re10k": IDESplatConfig(),
     "idesplat-acid": IDESplatConfig(),
     "idesplat-dl3dv": IDESplatConfig(feature_stride=8, far=200.0, height=256, width=448),
+    # Every part in small, for CPUs: 3.0 million parameters, trained from scratch, the ViT along.
+    "idesplat-tiny": IDESplatConfig(
+        backbone_channels=(24, 32, 48),
+        feature_channels=48,
+        transformer_layers=4,
+        transformer_ffn_ratio=2,
+        # Sixteen windows: at 256x256 they are 16 tokens a side, four times less work than with the releases' four.
+        attention_splits=4,
+        vit=ViTConfig(dim=96, depth=4, heads=3, grid=18, taps=(0, 1, 2, 3)),
+        dpt=DPTConfig(features=32, channels=(24, 48, 96, 96), disparity_channels=16),
+        dpbus=(
+            DPBUConfig(channels=64, candidates=97, scale=1, unet=UNetConfig(channels=48, levels=3)),
+            DPBUConfig(channels=32, candidates=25, scale=2, unet=UNetConfig(channels=16, levels=4)),
+            DPBUConfig(channels=16, candidates=13, scale=4, unet=UNetConfig(channels=8, levels=5)),
+        ),
+        residual_unet=UNetConfig(channels=8, levels=5),
+        focus=FocusConfig(channels=48, window=8, topk=(64, 64, 32, 32)),
+        # Procedural surfaces hardly shine: bands above the first would learn little, and double the .ply file.
+        sh_degree=1,
+    ),
+    "depthsplat-small-re10k": _SMALL,
+    "depthsplat-base-re10k": _BASE,
+    "depthsplat-large-re10k": _LARGE,
+    "depthsplat-base-re10k-256x448": replace(_BASE_8, height=256, width=448),
+    "depthsplat-base-dl3dv": replace(_BASE_8, far=200.0, height=256, width=448),
+    "depthsplat-small-re10kdl3dv": replace(_SMALL_8, far=200.0, scale_max=0.1, height=448, width=768),
+    "depthsplat-base-re10kdl3dv": replace(_BASE_8, far=200.0, scale_max=0.1, height=448, width=768),
+    "depthsplat-depth-small": replace(_SMALL_8, gaussians=False, height=352, width=640),
+    "depthsplat-depth-base": replace(_BASE_8, gaussians=False, height=352, width=640),
 }

@@ -11,17 +11,8 @@ from torch import Tensor, nn
 from .config import DPBUConfig, IDESplatConfig
 from .encoder import Encoded
 from .epipolar_attention import EpipolarAttention
-from .geometry import nearest_pixels, scale_intrinsics
+from .geometry import Cameras, nearest_pixels, scale_intrinsics
 from .layers import Merge, Upsample2x, fixed, resize
-
-
-class Cameras(NamedTuple):
-    """What the geometry needs of the views."""
-
-    extrinsics: Tensor  # [views, 4, 4] camera-to-world, OpenCV axes
-    intrinsics: Tensor  # [views, 3, 3] normalised by width and height
-    near: Tensor  # [views]
-    far: Tensor  # [views]
 
 
 class Boosted(NamedTuple):
@@ -71,7 +62,7 @@ class CoarseUnit(DepthProbabilityBoostingUnit):
         size = encoded.features_cnn.shape[2:]
         at_size = [encoded.features_cnn, encoded.features_mv, encoded.features_mono]
         context = self.merge(at_size, [encoded.mono_out], *size)
-        nearest, farthest = _per_view(1 / cameras.near), _per_view(1 / cameras.far)
+        farthest, nearest = cameras.inverse_range()
         steps = torch.linspace(0, 1, self.candidates, dtype=context.dtype, device=context.device)[None, :, None, None]
         candidates = (farthest + steps * (nearest - farthest)).expand(-1, -1, *size)
         return self.boost(context, context, encoded.mono_disparity, candidates, encoded.neighbours, cameras)
@@ -107,7 +98,7 @@ class FinerUnit(DepthProbabilityBoostingUnit):
 
     def candidates_around(self, seed: Tensor, cameras: Cameras) -> Tensor:
         """Candidates [views, candidates, h, w], evenly spaced around the seed within the cameras' range."""
-        nearest, farthest = _per_view(1 / cameras.near), _per_view(1 / cameras.far)
+        farthest, nearest = cameras.inverse_range()
         half = (self.candidates - 1) / 2
         reach = (nearest - farthest) / self.intervals * half
         low = torch.maximum(seed - reach, farthest)
@@ -122,7 +113,3 @@ def expectation(probability: Tensor, candidates: Tensor) -> tuple[Tensor, Tensor
     count = fixed(candidates.shape[1])
     probability = probability.reshape(views, -1, count, height * width).mean(1).reshape(-1, count, height, width)
     return (probability * candidates).sum(1, keepdim=True), probability
-
-
-def _per_view(x: Tensor) -> Tensor:
-    return x[:, None, None, None]

@@ -1,4 +1,4 @@
-"""What is known of the views before any depth: matching features, monocular features and relative disparity."""
+"""What is known of the views before any depth: features of a CNN, of matching across views, and of a ViT."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from .backbone import Backbone
-from .config import IDESplatConfig
+from .config import DepthSplatConfig, EncoderConfig, IDESplatConfig
 from .dinov2 import DinoV2
 from .dpt import DPTHead
 from .geometry import nearest_views
@@ -15,10 +15,12 @@ from .mv_transformer import MultiViewTransformer
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
+# Image size over that of the ViT's maps as DepthSplat uses them.
+MONO_STRIDE = 8
 
 
 class Encoded(NamedTuple):
-    """The encoder's maps; h and w are the image's size over the feature stride."""
+    """IDESplat's encoder's maps; h and w are the image's size over the feature stride."""
 
     neighbours: Tensor  # [views, n], the views that each is matched with
     features_cnn: Tensor  # [views, feature channels, h, w]
@@ -29,33 +31,79 @@ class Encoded(NamedTuple):
     mono_disparity: Tensor  # [views, 1, h, w], relative
 
 
-class Encoder(nn.Module):
-    """CNN pyramid, multi-view transformer, and Depth Anything V2 as the monocular branch."""
+class EncodedPyramid(NamedTuple):
+    """DepthSplat's encoder's maps; h and w are the image's size over the feature stride."""
 
-    def __init__(self, config: IDESplatConfig) -> None:
+    neighbours: Tensor  # [views, n], the views that each is matched with
+    features_cnn: Tensor  # [views, feature channels, h, w]
+    features_cnn_fine: Tensor  # [views, middle channels, 2h, 2w]
+    features_cnn_finest: Tensor  # [views, fine channels, H / 2, W / 2]
+    features_mv: Tensor  # [views, feature channels, h, w]
+    features_mono: Tensor  # [views, ViT channels, h, w]
+    # The four tapped blocks, each [views, ViT channels, patch rows, patch columns].
+    mono_1: Tensor
+    mono_2: Tensor
+    mono_3: Tensor
+    mono_4: Tensor
+
+
+class ViewEncoder(nn.Module):
+    """What both networks' encoders share: CNN pyramid, multi-view transformer and ViT."""
+
+    def __init__(self, config: EncoderConfig) -> None:
         super().__init__()
-        self.config = config
+        self.neighbours, self.patch = config.neighbours, config.vit.patch
         self.backbone = Backbone(config.backbone_channels, config.feature_channels, config.feature_stride)
         self.transformer = MultiViewTransformer(
             config.feature_channels, config.transformer_layers, config.transformer_ffn_ratio, config.attention_splits
         )
         self.vit = DinoV2(config.vit)
+
+    def mono_maps(self, images: Tensor) -> list[Tensor]:
+        """Normalised images -> the four tapped maps of the ViT, [views, ViT channels, patch rows, patch columns]."""
+        rows, columns = images.shape[2] // self.patch, images.shape[3] // self.patch
+        return self.vit(resize(images, rows * self.patch, columns * self.patch))
+
+
+class Encoder(ViewEncoder):
+    """IDESplat's: Depth Anything V2 is the monocular branch, with its head."""
+
+    def __init__(self, config: IDESplatConfig) -> None:
+        super().__init__(config)
         self.dpt = DPTHead(config.vit.dim, config.vit.patch, config.dpt)
 
     def forward(self, images: Tensor, extrinsics: Tensor) -> Encoded:
         """Images [views, 3, H, W] in [0, 1], extrinsics [views, 4, 4] -> the encoder's maps."""
-        neighbours = nearest_views(extrinsics, self.config.neighbours)
+        neighbours = nearest_views(extrinsics, self.neighbours)
         images = normalise(images)
-        cnn, cnn_fine = self.backbone(images)
+        cnn, cnn_fine, _ = self.backbone(images)
         mv = self.transformer(cnn, neighbours)
-
-        patch = self.config.vit.patch
-        rows, columns = images.shape[2] // patch, images.shape[3] // patch
-        maps = self.vit(resize(images, rows * patch, columns * patch))
+        maps = self.mono_maps(images)
         mono_out = self.dpt.features(maps)
         size = cnn.shape[2:]
-        disparity = resize(self.dpt.disparity(mono_out, rows, columns), *size)
+        disparity = resize(self.dpt.disparity(mono_out, *maps[-1].shape[2:]), *size)
         return Encoded(neighbours, cnn, cnn_fine, mv, resize(maps[-1], *size), mono_out, disparity)
+
+
+class PyramidEncoder(ViewEncoder):
+    """DepthSplat's: it hands on the maps of every resolution, for upsampling what is predicted."""
+
+    def __init__(self, config: DepthSplatConfig) -> None:
+        super().__init__(config)
+        # The releases bring the ViT's maps to this stride first, and from there to a finer feature stride.
+        self.growth = MONO_STRIDE // config.feature_stride
+
+    def forward(self, images: Tensor, extrinsics: Tensor) -> EncodedPyramid:
+        """Images [views, 3, H, W] in [0, 1], extrinsics [views, 4, 4] -> the encoder's maps."""
+        neighbours = nearest_views(extrinsics, self.neighbours)
+        images = normalise(images)
+        cnn, cnn_fine, cnn_finest = self.backbone(images)
+        mv = self.transformer(cnn, neighbours)
+        maps = self.mono_maps(images)
+        mono = resize(maps[-1], images.shape[2] // MONO_STRIDE, images.shape[3] // MONO_STRIDE)
+        if self.growth > 1:
+            mono = resize(mono, *cnn.shape[2:])
+        return EncodedPyramid(neighbours, cnn, cnn_fine, cnn_finest, mv, mono, *maps)
 
 
 def normalise(images: Tensor) -> Tensor:

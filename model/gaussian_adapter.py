@@ -7,8 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from .dpbu import Cameras
-from .geometry import invert_intrinsics, pixel_grid
+from .geometry import Cameras, invert_intrinsics, pixel_grid
 
 # The releases shift the raw scale before softplus, so that splats start at about pixel size.
 SCALE_SHIFT = 4.0
@@ -107,7 +106,7 @@ def quaternion_from_matrix(rotation: Tensor) -> Tensor:
         [m10 - m01, m02 + m20, m21 + m12, 1 - m00 - m11 + m22],
     ]
     stacked = torch.stack([torch.stack(row, dim=-1) for row in candidates], dim=-2)  # [views, 4, 4]
-    best = stacked.diagonal(dim1=-2, dim2=-1).argmax(-1)  # [views]
+    best = torch.stack([candidates[i][i] for i in range(4)], dim=-1).argmax(-1)  # [views]
     chosen = stacked.gather(-2, best[:, None, None].expand(-1, 1, 4))[:, 0]
     return chosen / chosen.norm(dim=-1, keepdim=True)
 

@@ -7,10 +7,11 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .config import IDESplatConfig
-from .dpbu import Boosted, Cameras
+from .dpbu import Boosted
 from .encoder import Encoded, normalise
 from .gaussian_adapter import GaussianAdapter, WorldGaussians
 from .gaussian_focus import GaussianFocusedModule
+from .geometry import Cameras
 from .layers import resize
 from .unet import CostRegulariser
 
@@ -74,8 +75,8 @@ class GaussianStage(nn.Module):
         fused = torch.zeros_like(maps[0][:, :, :1, :1])
         for share, x in zip(DEPTH_SHARES, maps, strict=True):
             fused = fused + share * resize(x, height, width)
-        near, far = (x[:, None, None, None] for x in (cameras.near, cameras.far))
-        return torch.minimum(torch.maximum(fused, 1 / far), 1 / near)
+        farthest, nearest = cameras.inverse_range()
+        return torch.minimum(torch.maximum(fused, farthest), nearest)
 
     def pixel_features(
         self, images: Tensor, inverse_depth: Tensor, encoded: Encoded, units: tuple[Boosted, Boosted, Boosted]

@@ -3,6 +3,8 @@
 Extrinsics are camera-to-world with OpenCV axes (x right, y down, z forward); intrinsics [views, 3, 3] have no skew.
 """
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -12,6 +14,19 @@ from .layers import repeat_views
 MIN_DEPTH = 1e-3
 # With this many views or fewer, the neighbours keep the order of the views; with more, they come nearest first.
 ORDERED_VIEWS = 3
+
+
+class Cameras(NamedTuple):
+    """What the geometry needs of the views."""
+
+    extrinsics: Tensor  # [views, 4, 4] camera-to-world, OpenCV axes
+    intrinsics: Tensor  # [views, 3, 3] normalised by width and height
+    near: Tensor  # [views]
+    far: Tensor  # [views]
+
+    def inverse_range(self) -> tuple[Tensor, Tensor]:
+        """The inverse depths of the far and of the near end, each [views, 1, 1, 1] to meet maps."""
+        return (1 / self.far)[:, None, None, None], (1 / self.near)[:, None, None, None]
 
 
 def invert_rigid(transform: Tensor) -> Tensor:
@@ -71,8 +86,7 @@ def project_candidates(
     inverse_depth: candidates in 1 / scene units, [views, candidates, h, w].
     intrinsics: in pixels of the same map, [views, 3, 3]; pixel centres at integers, as the releases warp.
     extrinsics: [views, 4, 4]. neighbours: [views, n].
-    Returns x and y in pixels and whether they lie inside the map and before the camera, each
-    [views * n, candidates, h * w].
+    Returns x and y in pixels and whether the point lies before the camera, each [views * n, candidates, h * w].
     """
     _, _, height, width = inverse_depth.shape
     relative = (invert_rigid(extrinsics)[neighbours] @ extrinsics[:, None]).flatten(0, 1)  # [pairs, 4, 4]
@@ -87,8 +101,7 @@ def project_candidates(
     x, y, z = (rays[:, axis : axis + 1] + relative[:, axis : axis + 1, 3:] * inverse for axis in range(3))
     x = x / z * target[:, 0, 0:1] + target[:, 0, 2:3]
     y = y / z * target[:, 1, 1:2] + target[:, 1, 2:3]
-    valid = (z > MIN_DEPTH * inverse) & (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-    return x, y, valid
+    return x, y, z > MIN_DEPTH * inverse
 
 
 def nearest_pixels(inverse_depth: Tensor, intrinsics: Tensor, extrinsics: Tensor, neighbours: Tensor) -> Tensor:
@@ -100,6 +113,34 @@ def nearest_pixels(inverse_depth: Tensor, intrinsics: Tensor, extrinsics: Tensor
     views, _, height, width = inverse_depth.shape
     with torch.no_grad():
         x, y, valid = project_candidates(inverse_depth, intrinsics, extrinsics, neighbours)
+        valid = valid & (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
         pixel = (y.round() * width + x.round()).to(torch.int32)
         first = (neighbours.flatten() * (height * width)).to(torch.int32)
         return torch.where(valid, pixel + first[:, None, None], views * height * width)
+
+
+def bilinear_pixels(
+    inverse_depth: Tensor, intrinsics: Tensor, extrinsics: Tensor, neighbours: Tensor
+) -> list[tuple[Tensor, Tensor]]:
+    """The warp of DepthSplat: the four pixels around where each candidate falls, and their bilinear weights.
+
+    Arguments as for `project_candidates`. Returns four pairs of rows, as of `nearest_pixels`, and float weights, both
+    [views * n, candidates, h * w]. Of a projection on the border only the pixels inside count, as with zero padding.
+    """
+    views, _, height, width = inverse_depth.shape
+    with torch.no_grad():
+        x, y, front = project_candidates(inverse_depth, intrinsics, extrinsics, neighbours)
+        left, top = x.floor(), y.floor()
+        across, down = x - left, y - top
+        first = (neighbours.flatten() * (height * width)).to(torch.int32)[:, None, None]
+        columns = ((left, 1 - across), (left + 1, across))
+        rows = ((top, 1 - down), (top + 1, down))
+        corners = []
+        for row, row_weight in rows:
+            row_inside = front & (row >= 0) & (row <= height - 1)
+            for column, column_weight in columns:
+                inside = row_inside & (column >= 0) & (column <= width - 1)
+                pixel = (row * width + column).to(torch.int32) + first
+                weight = torch.where(inside, row_weight * column_weight, 0.0)
+                corners.append((torch.where(inside, pixel, views * height * width), weight))
+        return corners

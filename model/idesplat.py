@@ -3,9 +3,10 @@
 from torch import Tensor, nn
 
 from .config import IDESplatConfig
-from .dpbu import Boosted, Cameras, CoarseUnit, FinerUnit
+from .dpbu import Boosted, CoarseUnit, FinerUnit
 from .encoder import Encoded, Encoder
 from .gaussian_head import GaussianStage, Predicted
+from .geometry import Cameras
 
 
 class IDESplat(nn.Module):

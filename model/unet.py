@@ -107,5 +107,8 @@ class CostRegulariser(nn.Module):
 
     def forward(self, x: Tensor, views: int) -> Tensor:
         """[groups * views, in_channels, h, w] -> probabilities [groups * views, candidates, h, w]."""
-        x = F.gelu(self.norm_in(self.conv_in(x)))
-        return softmax(self.conv_out(self.unet(x, views)), dim=1)
+        return softmax(self.scores(x, views), dim=1)
+
+    def scores(self, x: Tensor, views: int) -> Tensor:
+        """The same before the softmax."""
+        return self.conv_out(self.unet(F.gelu(self.norm_in(self.conv_in(x))), views))

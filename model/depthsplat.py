@@ -1,0 +1,76 @@
+"""DepthSplat: posed photographs to depth and Gaussians in one pass."""
+
+from torch import Tensor, nn
+
+from .config import DepthSplatConfig
+from .depth_stage import CoarseDepth, FineDepth, Matched
+from .encoder import EncodedPyramid, PyramidEncoder
+from .gaussian_head import Predicted
+from .gaussian_regressor import GaussianRegressor
+from .geometry import Cameras
+
+
+class DepthScales(nn.Module):
+    """The stages up to the depth, with one scale or two."""
+
+    def __init__(self, config: DepthSplatConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.encoder = PyramidEncoder(config)
+        if len(config.scales) == 1:
+            self.depth = CoarseDepth(config)
+        else:
+            self.depth1 = CoarseDepth(config)
+            self.depth2 = FineDepth(config)
+
+    def depth_stages(self, images: Tensor, cameras: Cameras) -> tuple[EncodedPyramid, tuple[Matched, ...]]:
+        """The encoded views and what each scale yields, coarsest first."""
+        encoded = self.encoder(images, cameras.extrinsics)
+        if len(self.config.scales) == 1:
+            return encoded, (self.depth(encoded, cameras),)
+        first = self.depth1(encoded, cameras)
+        return encoded, (first, self.depth2(encoded, first, cameras))
+
+
+class DepthSplat(DepthScales):
+    """The whole network; its parts are the stages that export, manifest and parity report name.
+
+    images ── encoder ── depth1 ── depth2 ── gaussians ── depth, means, scales, quats, opacities, sh
+                 │  1/stride │  2/stride │     │
+                 └───────────┴───────────┴─────┘ features of CNN, multi-view transformer, ViT
+
+    With one scale, `depth` stands in the place of `depth1` and `depth2`.
+    """
+
+    def __init__(self, config: DepthSplatConfig) -> None:
+        super().__init__(config)
+        self.gaussians = GaussianRegressor(config)
+
+    def forward(self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor, near: Tensor, far: Tensor) -> Predicted:
+        """Predict depth and Gaussians.
+
+        images: [views, 3, H, W], RGB in [0, 1]; H and W multiples of `config.size_multiple`, two views or more.
+        extrinsics: [views, 4, 4], camera-to-world, OpenCV axes.
+        intrinsics: [views, 3, 3], normalised by width and height.
+        near, far: [views], in scene units.
+        """
+        cameras = Cameras(extrinsics, intrinsics, near, far)
+        encoded, scales = self.depth_stages(images, cameras)
+        return self.gaussians(images, cameras, encoded, scales)
+
+    def stages(
+        self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor, near: Tensor, far: Tensor
+    ) -> tuple[EncodedPyramid | Matched | Predicted, ...]:
+        """What each stage yields, in order, for parity and for training with every stage supervised."""
+        cameras = Cameras(extrinsics, intrinsics, near, far)
+        encoded, scales = self.depth_stages(images, cameras)
+        return encoded, *scales, self.gaussians(images, cameras, encoded, scales)
+
+
+class DepthSplatDepth(DepthScales):
+    """DepthSplat without Gaussians, as the depth-only checkpoints have it."""
+
+    def forward(self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor, near: Tensor, far: Tensor) -> Tensor:
+        """Arguments as for `DepthSplat` -> metric z-depth [views, H, W]."""
+        _, scales = self.depth_stages(images, Cameras(extrinsics, intrinsics, near, far))
+        return 1 / scales[-1].inverse_depth_full[:, 0]
