@@ -178,7 +178,7 @@ PRESETS: dict[str, IDESplatConfig | DepthSplatConfig] = {
     "idesplat-re10k": IDESplatConfig(),
     "idesplat-acid": IDESplatConfig(),
     "idesplat-dl3dv": IDESplatConfig(feature_stride=8, far=200.0, height=256, width=448),
-    # Every part in small, for CPUs: 3.0 million parameters, trained from scratch, the ViT along.
+    # Every part in small, for CPUs: 3.5 million parameters, trained from scratch, the ViT along.
     "idesplat-tiny": IDESplatConfig(
         backbone_channels=(24, 32, 48),
         feature_channels=48,
@@ -191,7 +191,7 @@ PRESETS: dict[str, IDESplatConfig | DepthSplatConfig] = {
         dpbus=(
             DPBUConfig(channels=64, candidates=97, scale=1, unet=UNetConfig(channels=48, levels=3)),
             DPBUConfig(channels=32, candidates=25, scale=2, unet=UNetConfig(channels=16, levels=4)),
-            DPBUConfig(channels=16, candidates=13, scale=4, unet=UNetConfig(channels=8, levels=5)),
+            DPBUConfig(channels=8, candidates=9, scale=4, unet=UNetConfig(channels=8, levels=5)),
         ),
         residual_unet=UNetConfig(channels=8, levels=5),
         focus=FocusConfig(channels=48, window=8, topk=(64, 64, 32, 32)),
