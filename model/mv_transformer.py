@@ -97,10 +97,11 @@ class WindowAttention(nn.Module):
         q = grid.split(self.q_proj(source))  # [views, windows, tokens, channels]
         k, v = grid.split(self.k_proj(target)), grid.split(self.v_proj(target))
         mask = grid.mask
-        if (
-            neighbours is not None
-        ):  # the windows of all neighbours as one sequence: [views, windows, n * tokens, channels]
-            k, v = (x[neighbours].transpose(1, 2).flatten(2, 3) for x in (k, v))
+        if neighbours is not None:
+            # The windows of all neighbours as one sequence [views, windows, tokens * n, channels], neighbours fastest.
+            # The releases tile the mask all the same, so that with two neighbours or more it hides other tokens than
+            # those that the shift brought together. The weights were trained with it.
+            k, v = (x[neighbours].permute(0, 2, 3, 1, 4).flatten(2, 3) for x in (k, v))
             mask = None if mask is None else mask.repeat(1, 1, neighbours.shape[1])
         return self.norm(self.merge(grid.join(attention(q, k, v, mask))))
 
