@@ -1,0 +1,120 @@
+"""What training asks of each stage: inverse depth, its gradients and probabilities, and rendered novel views."""
+
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ..model.config import IDESplatConfig
+from ..model.dpbu import Boosted
+from ..model.encoder import Encoded
+
+# Shares of the terms of one stage's loss.
+FIRST_LAYER_SHARE = 0.5
+RELATIVE_SHARE = 3.0
+GRADIENT_SHARE = 0.5
+ENTROPY_SHARE = 0.3
+MONOCULAR_SHARE = 0.3
+# From here on errors count logarithmically, so that hidden and textureless pixels do not rule: relative to the truth's
+# inverse depth, and in candidates of the coarsest unit.
+LARGE_RELATIVE = 0.5
+LARGE_BINS = 8.0
+# The share of LPIPS beside the squared error (the papers' lambda).
+LPIPS_SHARE = 0.05
+# The file that torchvision keeps VGG16's weights in, on which LPIPS rests.
+VGG_WEIGHTS = "vgg16-397923af.pth"
+TINY = 1e-6
+
+Perceptual = Callable[[Tensor, Tensor], Tensor]
+
+
+def truth_at(inverse_depth: Tensor, height: int, width: int) -> Tensor:
+    """True inverse depth [views, H, W] at the pixels of a smaller map, [views, 1, height, width].
+
+    Corners lie on corners, as where the network resizes. Values are picked and never mixed across an edge.
+    """
+    rows = torch.linspace(0, inverse_depth.shape[1] - 1, height).round().long()
+    columns = torch.linspace(0, inverse_depth.shape[2] - 1, width).round().long()
+    return inverse_depth[:, rows][:, :, columns][:, None]
+
+
+def coarse_bin(config: IDESplatConfig, near: Tensor, far: Tensor) -> Tensor:
+    """The distance of the coarsest unit's candidates, in inverse scene units, [views, 1, 1, 1]."""
+    return ((1 / near - 1 / far) / (config.dpbus[0].candidates - 1))[:, None, None, None]
+
+
+def inverse_depth_loss(predicted: Tensor, truth: Tensor, bins: Tensor) -> Tensor:
+    """|1/D - 1/D*| in candidates and relative to 1/D*, and its gradient's error along x and y.
+
+    predicted, truth: inverse depth [views, 1, h, w]. bins: [views, 1, 1, 1].
+    """
+    error = (predicted - truth).abs()
+    absolute = softened(error / bins, LARGE_BINS)
+    relative = softened(error / truth, LARGE_RELATIVE)
+    loss = absolute.mean() + RELATIVE_SHARE * relative.mean()
+    for axis in (2, 3):
+        step = (predicted.diff(dim=axis) - truth.diff(dim=axis)).abs() / bins
+        loss = loss + GRADIENT_SHARE * softened(step, 1.0).mean()
+    return loss
+
+
+def softened(error: Tensor, large: float) -> Tensor:
+    """Errors as they are while small, and their logarithm once `large`."""
+    return large * torch.log1p(error / large)
+
+
+def entropy_loss(unit: Boosted, truth: Tensor) -> Tensor:
+    """Cross entropy with the two candidates next to the truth, shared by distance; pixels outside the candidates: none.
+
+    truth: inverse depth [views, 1, h, w].
+    """
+    low = unit.candidates[:, :1]
+    step = unit.candidates[:, 1:2] - low
+    last = unit.candidates.shape[1] - 1
+    position = (truth - low) / step.clamp(min=TINY)
+    inside = (position >= 0) & (position <= last)
+    below = position.floor().clamp(0, last - 1)
+    upper = (position - below).clamp(0, 1)
+    index = below.long()
+    log = unit.probability.clamp(min=TINY).log()
+    entropy = -(1 - upper) * log.gather(1, index) - upper * log.gather(1, index + 1)
+    return (entropy * inside).sum() / inside.sum().clamp(min=1)
+
+
+def unit_loss(unit: Boosted, inverse_depth: Tensor, bins: Tensor) -> Tensor:
+    """Everything that one boosting unit is asked; inverse_depth: the truth, [views, H, W]."""
+    truth = truth_at(inverse_depth, *unit.inverse_depth.shape[2:])
+    loss = inverse_depth_loss(unit.inverse_depth, truth, bins) + ENTROPY_SHARE * entropy_loss(unit, truth)
+    return loss + FIRST_LAYER_SHARE * inverse_depth_loss(unit.inverse_depth_first, truth, bins)
+
+
+def monocular_loss(encoded: Encoded, inverse_depth: Tensor) -> Tensor:
+    """The monocular branch knows no scale: both disparities are divided by their mean over all views."""
+    disparity = encoded.mono_disparity
+    truth = truth_at(inverse_depth, *disparity.shape[2:])
+    error = (disparity / disparity.mean().clamp(min=TINY) - truth / truth.mean()).abs()
+    return MONOCULAR_SHARE * softened(error, 1.0).mean()
+
+
+def photometric_loss(rendered: Tensor, truth: Tensor, perceptual: Perceptual | None) -> Tensor:
+    """Squared error, plus LPIPS where there is one; images [views, 3, H, W] in [0, 1]."""
+    loss = F.mse_loss(rendered, truth)
+    return loss if perceptual is None else loss + LPIPS_SHARE * perceptual(rendered, truth)
+
+
+def load_perceptual() -> Perceptual | None:
+    """LPIPS if the `lpips` package and VGG16's weights are on this machine, else None and a warning; no download."""
+    try:
+        import lpips
+    except ImportError:
+        warnings.warn("LPIPS is left out of the loss: the package lpips is not installed", stacklevel=2)
+        return None
+    weights = Path(torch.hub.get_dir()) / "checkpoints" / VGG_WEIGHTS
+    if not weights.is_file():
+        warnings.warn(f"LPIPS is left out of the loss: VGG16's weights are not at {weights}", stacklevel=2)
+        return None
+    network = lpips.LPIPS(net="vgg", verbose=False).requires_grad_(False)
+    return lambda rendered, truth: network(rendered, truth, normalize=True).mean()

@@ -1,0 +1,221 @@
+"""The command that trains IDESplat on procedural scenes, from nothing or from a checkpoint.
+
+Every step draws its scenes from the seed and the step's number alone, so that a run that was stopped goes on as if it
+had not been.
+"""
+
+import ctypes
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ..runtime.errors import InputError, exit_on_input_error
+from ..runtime.files import make_folder
+from .curriculum import Objective, Phase, curriculum, phase_at, rate_at
+
+if TYPE_CHECKING:  # torch and compiled code are loaded only once there is something to train
+    from ..model.config import IDESplatConfig
+    from .losses import Perceptual
+    from .training_data import Order, Views
+
+CHECKPOINT, LOG, CURVES, PICTURES = "last.ckpt", "log.jsonl", "curves.png", "predictions.png"
+CURVES_SHOWN = ("loss", "abs_rel", "validation_abs_rel", "validation_psnr", "gradient")
+# glibc's mallopt parameters: without them every large tensor's memory goes back to the system and is cleared again.
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
+LARGE = 2**31 - 1
+# The ViT and the shrinking levels of its head want more than one patch of 14 pixels a side.
+LEAST_SIDE = 32
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What decides a run's result; a checkpoint can only be resumed with the same."""
+
+    preset: str
+    objective: str
+    gradual: bool
+    steps: int
+    batch: int
+    size: int
+    lr: float
+    vit_lr: float
+    seed: int
+    init: str
+
+
+@exit_on_input_error
+def train(
+    out: Annotated[Path, typer.Option(help="Folder for checkpoint, log and pictures; a run in it is resumed.")],
+    preset: Annotated[str, typer.Option(help="The network, one of the IDESplat presets.")] = "idesplat-tiny",
+    init: Annotated[Path | None, typer.Option(help="Checkpoint to start from, released or own.")] = None,
+    objective: Annotated[Objective, typer.Option(help="True depth, rendered novel views, or both.")] = Objective.BOTH,
+    gradual: Annotated[
+        bool, typer.Option(help="Coarse depth first, then finer, then Gaussians; else everything from the start.")
+    ] = True,
+    steps: Annotated[int, typer.Option(help="Steps of the whole run.", min=1)] = 20000,
+    batch: Annotated[int, typer.Option(help="Scenes of a step.", min=1)] = 2,
+    size: Annotated[int, typer.Option(help="Side of the images in the last phase, in pixels.", min=64)] = 256,
+    lr: Annotated[float, typer.Option(help="Highest learning rate.", min=0)] = 1e-3,
+    vit_lr: Annotated[float, typer.Option(help="Highest learning rate of the ViT.", min=0)] = 5e-4,
+    seed: Annotated[int, typer.Option(help="Of the weights and the scenes.", min=0)] = 0,
+    threads: Annotated[int, typer.Option(help="torch's threads; drawing scenes takes a share of another.", min=1)] = 1,
+    save_every: Annotated[float, typer.Option(help="Minutes between checkpoints.", min=0)] = 3.0,
+    validate_every: Annotated[int, typer.Option(help="Steps between validations.", min=1)] = 200,
+) -> None:
+    """Train IDESplat on procedural scenes with exact depth and cameras."""
+    settings = Settings(
+        preset, objective.value, gradual, steps, batch, size, lr, vit_lr, seed, str(init.resolve()) if init else ""
+    )
+    config = _config(settings)
+    _keep_memory()
+    import torch
+
+    torch.set_num_threads(threads)
+    torch.set_flush_denormal(True)
+    Run(make_folder(out), settings, config).go(save_every * 60, validate_every)
+
+
+class Run:
+    """One training run in its folder."""
+
+    def __init__(self, folder: Path, settings: Settings, config: "IDESplatConfig") -> None:
+        """Start it, or go on from the checkpoint in the folder; raises InputError if that is another run's."""
+        from .losses import load_perceptual
+        from .training_log import TrainingLog
+        from .training_state import TrainingState
+
+        self.folder, self.settings = folder, settings
+        self.objective = Objective(settings.objective)
+        self.phases = curriculum(self.objective, settings.gradual)
+        self.state: TrainingState = TrainingState(config, settings.seed, settings.lr, settings.vit_lr)
+        if (folder / CHECKPOINT).exists():
+            self.state.resume(folder / CHECKPOINT, asdict(settings))
+        elif settings.init:
+            self.state.start_from(Path(settings.init))
+        self.log: TrainingLog = TrainingLog(folder / LOG, self.state.step)
+        renders = any(phase.gaussians for phase in self.phases)
+        self.perceptual: Perceptual | None = load_perceptual() if renders else None
+
+    def go(self, save_every: float, validate_every: int) -> None:
+        """Train to the last step. save_every: seconds; validate_every: steps."""
+        from .training_data import drawn_ahead
+
+        saved = time.monotonic()
+        bar = Bar(self.settings.steps, self.state.step)
+        with bar.progress:
+            scenes = drawn_ahead(self.orders())
+            while self.state.step < self.settings.steps:
+                entry = self.one_step(scenes)
+                if self.state.step % validate_every == 0 or self.state.step == self.settings.steps:
+                    entry |= self.validate()
+                self.log.add(entry)
+                bar.show(entry)
+                if time.monotonic() - saved >= save_every:
+                    self.save()
+                    saved = time.monotonic()
+            scenes.close()
+        self.save()
+        folder = self.folder
+        print(f"{folder / CHECKPOINT}: the trained network, for idesplat-export; {folder / LOG}: every step")
+        print(f"{folder / CURVES} and {folder / PICTURES}: curves, and photograph, truth, prediction and error")
+
+    def phase(self, step: int) -> Phase:
+        """The phase of a step, counted from 0."""
+        return phase_at(self.phases, step, self.settings.steps)
+
+    def orders(self) -> "Iterator[Order]":
+        """The scenes of every step from here on."""
+        from .training_data import training_order
+
+        for step in range(self.state.step, self.settings.steps):
+            phase = self.phase(step)
+            side = self.settings.size // phase.shrink
+            for slot in range(self.settings.batch):
+                yield training_order(self.settings.seed, step, slot, int(phase.gaussians), side, side, phase.units > 1)
+
+    def one_step(self, scenes: "Iterator[Views]") -> dict[str, Any]:
+        """Gather the gradients of a batch and step along them; returns what is logged."""
+        from .training_log import finite
+        from .training_step import scene_loss
+
+        started = time.monotonic()
+        phase, batch = self.phase(self.state.step), self.settings.batch
+        entries = []
+        for _ in range(batch):
+            loss, entry = scene_loss(self.state.model, next(scenes), phase, self.objective, self.perceptual)
+            (loss / batch).backward()
+            entries.append(entry)
+        norm = self.state.update(rate_at(self.state.step, self.settings.steps))
+        means = {name: finite(sum(entry[name] for entry in entries) / batch) for name in entries[0]}
+        seconds = round(time.monotonic() - started, 3)
+        return {"step": self.state.step, **means, "gradient": finite(norm), "seconds": seconds}
+
+    def validate(self) -> dict[str, Any]:
+        """Measure the mean network on validation scenes at the phase's size, and draw predictions and curves."""
+        from .training_log import finite
+        from .validation import validate
+
+        phase = self.phase(self.state.step - 1)
+        side = self.settings.size // phase.shrink
+        found = validate(self.state.mean_model(), phase, side, self.folder / PICTURES)
+        self.log.draw_curves(self.folder / CURVES, CURVES_SHOWN)
+        return {name: finite(value) for name, value in found.items()}
+
+    def save(self) -> None:
+        """Write the checkpoint, whole or not at all."""
+        self.state.save(self.folder / CHECKPOINT, asdict(self.settings))
+
+
+class Bar:
+    """What a user sees of the run: a bar on stderr where that is a terminal, else nothing."""
+
+    def __init__(self, steps: int, done: int) -> None:
+        """`steps`: of the whole run, `done`: when it was resumed."""
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+        self.progress = Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty())
+        self.task = self.progress.add_task("training", total=steps, completed=done)
+
+    def show(self, entry: dict[str, Any]) -> None:
+        """Bring the bar to a step that has been logged."""
+        loss, abs_rel = (f"{entry[name]:.3f}" if entry[name] is not None else "-" for name in ("loss", "abs_rel"))
+        self.progress.update(self.task, completed=entry["step"], description=f"loss {loss}, AbsRel {abs_rel}")
+
+
+def _config(settings: Settings) -> "IDESplatConfig":
+    """The preset's configuration; raises InputError if there is none, or the size does not fit it."""
+    from ..model.config import PRESETS, IDESplatConfig
+
+    presets = {name: config for name, config in PRESETS.items() if isinstance(config, IDESplatConfig)}
+    if settings.preset not in presets:
+        raise InputError(f"--preset {settings.preset}: no such preset; choose one of {', '.join(presets)}")
+    config = presets[settings.preset]
+    phases = curriculum(Objective(settings.objective), settings.gradual)
+    multiple = max(phase.shrink for phase in phases) * max(config.size_multiple, LEAST_SIDE)
+    if settings.size % multiple:
+        raise InputError(f"--size {settings.size}: must be a multiple of {multiple} for this preset and these phases")
+    return config
+
+
+def _keep_memory() -> None:
+    """Have glibc keep freed memory for the next step, where there is glibc."""
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    if mallopt is not None:
+        for parameter in (M_TRIM_THRESHOLD, M_MMAP_THRESHOLD):
+            mallopt(parameter, LARGE)
+
+
+def main() -> None:
+    """Run the command."""
+    typer.run(train)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,93 @@
+"""Training scenes as tensors, drawn in the background in the order in which the steps use them."""
+
+from collections import deque
+from collections.abc import Generator, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .scenes import TRAINING_SEEDS, Sample, draw_sample
+
+# Share of the scenes with three context views instead of two.
+THREE_VIEW_SHARE = 0.1
+# Scenes drawn ahead of their use.
+AHEAD = 4
+
+
+@dataclass(frozen=True)
+class Views:
+    """What a network is given of a scene, and the truth."""
+
+    images: Tensor  # [context, 3, H, W] in [0, 1]
+    extrinsics: Tensor  # [context, 4, 4] camera-to-world, OpenCV axes
+    intrinsics: Tensor  # [context, 3, 3] normalised by width and height
+    near: Tensor  # [context]
+    far: Tensor  # [context]
+    inverse_depth: Tensor  # [context, H, W], the truth, in 1 / scene units
+    target_images: Tensor  # [targets, 3, H, W]
+    target_extrinsics: Tensor  # [targets, 4, 4]
+    target_intrinsics: Tensor  # [targets, 3, 3]
+
+
+@dataclass(frozen=True)
+class Order:
+    """One scene as a step wants it."""
+
+    seed: int
+    context: int
+    targets: int
+    height: int
+    width: int
+
+
+def to_views(sample: Sample) -> Views:
+    """A procedural sample as tensors."""
+    count = sample.context
+    images, extrinsics, intrinsics = (
+        torch.from_numpy(part) for part in (sample.images, sample.extrinsics, sample.intrinsics)
+    )
+    return Views(
+        images[:count],
+        extrinsics[:count],
+        intrinsics[:count],
+        torch.full((count,), sample.near),
+        torch.full((count,), sample.far),
+        1 / torch.from_numpy(sample.depth[:count]),
+        images[count:],
+        extrinsics[count:],
+        intrinsics[count:],
+    )
+
+
+def draw_views(order: Order) -> Views:
+    """The scene of an order; the same order gives the same scene."""
+    return to_views(draw_sample(order.seed, order.context, order.targets, order.height, order.width))
+
+
+def training_order(seed: int, step: int, slot: int, targets: int, height: int, width: int, many: bool) -> Order:
+    """The scene at place `slot` of a step's batch, drawn from the run's seed and the step alone.
+
+    many: whether some scenes are to have three context views.
+    """
+    rng = np.random.default_rng((seed, step, slot))
+    context = 3 if many and rng.random() < THREE_VIEW_SHARE else 2
+    return Order(int(rng.integers(TRAINING_SEEDS.start, TRAINING_SEEDS.stop)), context, targets, height, width)
+
+
+def drawn_ahead(orders: Iterator[Order]) -> Generator[Views]:
+    """The scenes of `orders`, in that order, drawn by a thread while the caller is at work."""
+    with ThreadPoolExecutor(1, thread_name_prefix="scenes") as pool:
+        waiting: deque[Future[Views]] = deque()
+        try:
+            for order in orders:
+                waiting.append(pool.submit(draw_views, order))
+                if len(waiting) > AHEAD:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            for future in waiting:
+                future.cancel()

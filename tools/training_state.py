@@ -1,0 +1,119 @@
+"""All that a training run must remember: weights, their running mean, the optimiser, the step; saved whole or not."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ..model.checkpoint import CheckpointError, fill, read_state_dict
+from ..model.config import IDESplatConfig
+from ..model.idesplat import IDESplat
+from ..runtime.errors import InputError
+from ..runtime.files import replacing
+
+# The running mean forgets at this rate, and faster in the beginning.
+MEAN_DECAY = 0.995
+MEAN_START = 10
+WEIGHT_DECAY = 0.01
+LARGEST_GRADIENT = 1.0
+# The optimiser's groups, in this order.
+BACKBONE_PREFIX = "encoder.vit."
+
+
+class TrainingState:
+    """The network in training. `step` counts the steps done."""
+
+    def __init__(self, config: IDESplatConfig, seed: int, lr: float, vit_lr: float) -> None:
+        """A new network drawn from `seed`; learning rates at their highest, the ViT's and that of the rest."""
+        self.model = new_model(config, seed)
+        self.mean = {name: value.clone() for name, value in self.model.state_dict().items()}
+        self.step = 0
+        parameters = list(self.model.named_parameters())
+        groups = [
+            {"params": [p for name, p in parameters if not name.startswith(BACKBONE_PREFIX)], "highest": lr},
+            {"params": [p for name, p in parameters if name.startswith(BACKBONE_PREFIX)], "highest": vit_lr},
+        ]
+        self.optimizer = torch.optim.AdamW(groups, lr=lr, weight_decay=WEIGHT_DECAY)
+
+    def start_from(self, path: Path) -> None:
+        """Take the weights of a checkpoint, released or own; raises InputError if it does not fit the network."""
+        try:
+            fill(self.model, read_state_dict(path), path)
+        except CheckpointError as error:
+            raise InputError(str(error)) from None
+        self.mean = {name: value.clone() for name, value in self.model.state_dict().items()}
+
+    def update(self, rate: float) -> float:
+        """Step along the gradients gathered, at `rate` times the highest learning rates; returns the gradient's norm.
+
+        A step whose gradient is not finite leaves the weights as they are.
+        """
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate * group["highest"]
+        norm = float(nn.utils.clip_grad_norm_(self.model.parameters(), LARGEST_GRADIENT))
+        if math.isfinite(norm):
+            self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+        self.step += 1
+        decay = min(MEAN_DECAY, self.step / (self.step + MEAN_START))
+        for name, value in self.model.state_dict().items():
+            self.mean[name].lerp_(value, 1 - decay)
+        return norm
+
+    def mean_model(self) -> IDESplat:
+        """The network with the running mean of the weights, which predicts better than the last weights."""
+        model = IDESplat(self.model.config).eval()
+        model.load_state_dict(self.mean)
+        return model
+
+    def save(self, path: Path, settings: dict[str, Any]) -> None:
+        """Write a checkpoint whose `state_dict` is the mean, as the exporter reads it, beside what resuming needs."""
+        content = {
+            "state_dict": self.mean,
+            "training": {
+                "weights": self.model.state_dict(),
+                "optimizer": self.optimizer.state_dict(),
+                "step": self.step,
+                "settings": settings,
+            },
+        }
+        with replacing(path) as temporary:
+            torch.save(content, temporary)
+
+    def resume(self, path: Path, settings: dict[str, Any]) -> None:
+        """Go on from a checkpoint of the same run; raises InputError for one of another run or none at all."""
+        try:
+            content = torch.load(path, weights_only=True)
+            training: dict[str, Any] = content["training"]
+        except Exception as error:  # torch raises whatever it meets inside of a file that is not a checkpoint
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
+            raise InputError(f"{path}: not a checkpoint of a training run ({reason}); choose another --out") from None
+        before = training["settings"]
+        changed = [
+            f"{name} was {before.get(name)}, not {settings[name]}"
+            for name in settings
+            if before.get(name) != settings[name]
+        ]
+        if changed:
+            raise InputError(
+                f"{path}: belongs to a run with other settings ({', '.join(changed)}); "
+                "repeat them, or choose another --out and start from this file with --init"
+            )
+        self.model.load_state_dict(training["weights"])
+        self.optimizer.load_state_dict(training["optimizer"])
+        self.mean = content["state_dict"]
+        self.step = training["step"]
+
+
+def new_model(config: IDESplatConfig, seed: int) -> IDESplat:
+    """A network with weights drawn from `seed`."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        model = IDESplat(config)
+    # The monocular disparity is one over this layer's output: it must start away from zero.
+    bias = model.encoder.dpt.disparity3.bias
+    assert isinstance(bias, Tensor)
+    nn.init.ones_(bias)
+    return model

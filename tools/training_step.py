@@ -1,0 +1,96 @@
+"""One scene through the parts of the network that a phase trains: predictions, losses and measures."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ..model.dpbu import Boosted, Cameras
+from ..model.encoder import Encoded
+from ..model.geometry import invert_rigid, scale_intrinsics
+from ..model.idesplat import IDESplat
+from ..model.layers import resize
+from .curriculum import Objective, Phase
+from .losses import Perceptual, coarse_bin, inverse_depth_loss, monocular_loss, photometric_loss, unit_loss
+from .torch_rasterizer import rasterize
+from .training_data import Views
+
+# Squared errors of colours are small beside errors of depth counted in candidates.
+PHOTOMETRIC_SHARE = 10.0
+WITHIN = 0.05
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What the parts that ran say of a scene."""
+
+    encoded: Encoded
+    units: tuple[Boosted, ...]
+    # The best inverse depth there is, [views, 1, h, w]; h and w are the images' once three units ran.
+    inverse_depth: Tensor
+    # Novel views, [targets, 3, H, W], where the phase has Gaussians.
+    rendered: Tensor | None
+
+
+def run_phase(model: IDESplat, views: Views, phase: Phase) -> Outcome:
+    """Run the encoder and as many units as the phase has; with three also the depth fusion and, if asked, all else."""
+    cameras = Cameras(views.extrinsics, views.intrinsics, views.near, views.far)
+    encoded = model.encoder(views.images, views.extrinsics)
+    first = model.dpbu1(encoded, cameras)
+    if phase.units == 1:
+        return Outcome(encoded, (first,), first.inverse_depth, None)
+    second = model.dpbu2(encoded, first, cameras)
+    if phase.units == 2:
+        return Outcome(encoded, (first, second), second.inverse_depth, None)
+    units = (first, second, model.dpbu3(encoded, second, cameras))
+    if not phase.gaussians:
+        fused = model.gaussians.fused_inverse_depth(units, cameras, *views.images.shape[2:])
+        return Outcome(encoded, units, fused, None)
+    predicted = model.gaussians(views.images, cameras, encoded, units)
+    rendered = render_targets(predicted.gaussians, views)
+    return Outcome(encoded, units, 1 / predicted.depth[:, None], rendered)
+
+
+def render_targets(gaussians: tuple[Tensor, ...], views: Views) -> Tensor:
+    """The Gaussians (means, scales, quats, opacities, sh) from the target cameras, on black, [targets, 3, H, W]."""
+    means, scales, quats, opacities, sh = gaussians
+    height, width = views.target_images.shape[2:]
+    pixels = scale_intrinsics(views.target_intrinsics, height, width)
+    background = torch.zeros(3)
+    images = [
+        rasterize(means, quats, scales, opacities, sh, viewmat, K, width, height, background)[0]
+        for viewmat, K in zip(invert_rigid(views.target_extrinsics), pixels, strict=True)
+    ]
+    return torch.stack(images).permute(0, 3, 1, 2)
+
+
+def scene_loss(
+    model: IDESplat, views: Views, phase: Phase, objective: Objective, perceptual: Perceptual | None
+) -> tuple[Tensor, dict[str, float]]:
+    """The loss of a scene, and what is logged of it."""
+    outcome = run_phase(model, views, phase)
+    loss = torch.zeros(())
+    entry = measures(outcome, views)
+    if objective is not Objective.PHOTOMETRIC:
+        bins = coarse_bin(model.config, views.near, views.far)
+        loss = loss + monocular_loss(outcome.encoded, views.inverse_depth)
+        loss = loss + sum(unit_loss(unit, views.inverse_depth, bins) for unit in outcome.units)
+        if phase.units == 3:
+            loss = loss + inverse_depth_loss(outcome.inverse_depth, views.inverse_depth[:, None], bins)
+    if outcome.rendered is not None:
+        loss = loss + PHOTOMETRIC_SHARE * photometric_loss(outcome.rendered, views.target_images, perceptual)
+    return loss, {"loss": float(loss.detach()), **entry}
+
+
+@torch.no_grad()
+def measures(outcome: Outcome, views: Views) -> dict[str, float]:
+    """AbsRel (mean of |D / D* - 1|) and the share of pixels within 5 % at the size of the images; PSNR of novel views.
+
+    Pixels that only one view sees are counted too.
+    """
+    inverse_depth = resize(outcome.inverse_depth, *views.images.shape[2:])[:, 0]
+    error = (views.inverse_depth / inverse_depth - 1).abs()
+    entry = {"abs_rel": float(error.mean()), "within": float((error < WITHIN).float().mean())}
+    if outcome.rendered is not None:
+        entry["psnr"] = float(-10 * (outcome.rendered - views.target_images).square().mean().log10())
+    return entry
