@@ -31,10 +31,10 @@ class Phase:
 
 
 GRADUAL = (
-    Phase(0.50, units=1, gaussians=False, shrink=2),
-    Phase(0.68, units=2, gaussians=False, shrink=2),
+    Phase(0.55, units=1, gaussians=False, shrink=2),
+    Phase(0.70, units=2, gaussians=False, shrink=2),
     Phase(0.80, units=3, gaussians=False, shrink=2),
-    Phase(0.95, units=3, gaussians=True, shrink=2),
+    Phase(0.96, units=3, gaussians=True, shrink=2),
     Phase(1.00, units=3, gaussians=True, shrink=1),
 )
 
