@@ -1,5 +1,6 @@
 """Strict loading of released checkpoints: every key and every shape, or an error that names what differs."""
 
+import functools
 import hashlib
 import pickle
 import re
@@ -56,7 +57,8 @@ def read_state_dict(path: Path) -> dict[str, Tensor]:
     if not isinstance(content, dict):
         raise CheckpointError(f"{path}: holds a {type(content).__name__}, expected a state dict; is it a checkpoint?")
     tensors = {key: value for key, value in content.items() if isinstance(value, Tensor)}
-    if any(key.startswith(PREFIX) for key in tensors):  # other prefixes belong to the loss and are not ours
+    # Released files alone have a depth predictor; this project's own have a stage called encoder.
+    if any(key.startswith(PREFIX + DEPTH_PREFIX) for key in tensors):  # other prefixes belong to the loss and are not ours
         tensors = {key.removeprefix(PREFIX): value for key, value in tensors.items() if key.startswith(PREFIX)}
     if not tensors:
         raise CheckpointError(f"{path}: holds no tensors, expected a state dict; is it a checkpoint?")
@@ -149,6 +151,7 @@ def fill(model: Network, tensors: dict[str, Tensor], path: Path) -> None:
     model.load_state_dict({key: value.reshape(own[key].shape) for key, value in renamed.items()})
 
 
+@functools.cache
 def _expected_shapes(config: IDESplatConfig | DepthSplatConfig) -> dict[str, tuple[int, ...]]:
     with torch.device("meta"):
         return {key: tuple(value.shape) for key, value in build(config).state_dict().items()}
