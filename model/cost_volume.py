@@ -12,7 +12,8 @@ def cost_volume(features: Tensor, candidates: Tensor, cameras: Cameras, neighbou
 
     candidates: inverse depths [views, candidates, h, w]. neighbours: [views, n]; their costs are averaged.
     Interpolation and inner product commute, so each of the four pixels is correlated first and the four numbers are
-    interpolated, not the features.
+    interpolated, not the features. Each view projects with its own intrinsics; the release projects into a neighbour
+    with those of the view that looks, which are the same in all that it was trained on.
     """
     views, _, height, width = features.shape
     channels = fixed(features.shape[1])
