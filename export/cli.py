@@ -17,6 +17,7 @@ from ..runtime.files import check_writable, make_folder, replacing
 if TYPE_CHECKING:
     import onnx
 
+    from ..model.depthsplat import DepthSplat
     from ..model.idesplat import IDESplat
     from .exporter import Fixed
     from .verify import Parity
@@ -88,25 +89,32 @@ def _parse_size(text: str, multiple: int) -> tuple[int, int]:
     return height, width
 
 
-def _load(checkpoint: Path, preset: str | None) -> "tuple[IDESplat, str]":
+def _load(checkpoint: Path, preset: str | None) -> "tuple[IDESplat | DepthSplat, str]":
     """The network with the file's weights, and the preset's name."""
-    from ..model.checkpoint import fill, infer_preset, read_state_dict
+    from ..model.checkpoint import fill, infer_preset, name_hash_warning, read_state_dict
     from ..model.config import PRESETS
+    from ..model.depthsplat import DepthSplat
     from ..model.idesplat import IDESplat
+    from ..model.networks import build
 
     if preset is not None and preset not in PRESETS:
         raise InputError(f"--preset {preset}: unknown; choose one of {', '.join(PRESETS)}")
     print(f"reading {checkpoint}")
+    warning = name_hash_warning(checkpoint) if checkpoint.is_file() else None
+    if warning:
+        print(f"warning: {warning}", file=sys.stderr)
     tensors = read_state_dict(checkpoint)
     name = preset or infer_preset(checkpoint, tensors)
-    model = IDESplat(PRESETS[name])
+    model = build(name)
+    if not isinstance(model, IDESplat | DepthSplat):
+        raise InputError(f"{checkpoint}: preset {name} has depth alone, which cannot be exported yet")
     fill(model, tensors, checkpoint)
     count = sum(parameter.numel() for parameter in model.parameters())
     print(f"preset {name}, {count:,} parameters")
     return model.eval(), name
 
 
-def _describe(model: "IDESplat", preset: str, checkpoint: Path, fixed: "Fixed") -> Description:
+def _describe(model: "IDESplat | DepthSplat", preset: str, checkpoint: Path, fixed: "Fixed") -> Description:
     config = model.config
     height, width = fixed.size or (config.height, config.width)
     with checkpoint.open("rb") as file:
@@ -127,7 +135,9 @@ def _describe(model: "IDESplat", preset: str, checkpoint: Path, fixed: "Fixed") 
     )
 
 
-def _export(model: "IDESplat", description: Description, fixed: "Fixed", out: Path | None, staged: Path | None) -> bool:
+def _export(
+    model: "IDESplat | DepthSplat", description: Description, fixed: "Fixed", out: Path | None, staged: Path | None
+) -> bool:
     """Trace, verify and write; False and nothing written if the graph departs from the network."""
     import onnx
     from rich.console import Console
@@ -169,16 +179,15 @@ def _write_stages(traced: "onnx.ModelProto", description: Description, staged: P
     import onnx
 
     from .exporter import stage_graph
-    from .stages import IDESPLAT_STAGES
+    from .stages import find_stages
 
     temporary = Path(tempfile.mkdtemp(prefix=f".{staged.name}.", dir=staged.parent))
     try:
         files = []
-        for stage in IDESPLAT_STAGES:
+        for stage in find_stages(traced):
             graph = stage_graph(traced, stage, description)
             onnx.checker.check_model(graph, full_check=True)
-            inputs = [entry.name for entry in graph.graph.input]
-            files.append(StageFile(stage.name, f"{stage.name}.onnx", inputs, list(stage.outputs)))
+            files.append(StageFile(stage.name, f"{stage.name}.onnx", list(stage.inputs), list(stage.outputs)))
             (temporary / files[-1].file).write_bytes(graph.SerializeToString())
         write_manifest(temporary, files)
         temporary.chmod(0o755)

@@ -4,7 +4,6 @@ import copy
 import logging
 import tempfile
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,7 +52,8 @@ def trace(network: NamedTensors, near: float, far: float, multiple: int, fixed: 
         warnings.simplefilter("ignore")  # deprecation of the path, and tracing warnings on sizes fixed on purpose
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)
         path = Path(folder) / "traced.onnx"
-        axes = _dynamic_axes(network.names, fixed)
+        shapes = {name: tuple(tensor.shape) for name, tensor in network.named(*inputs).items()}
+        axes = _dynamic_axes(shapes, fixed)
         torch.onnx.export(
             network,
             inputs,
@@ -61,19 +61,23 @@ def trace(network: NamedTensors, near: float, far: float, multiple: int, fixed: 
             dynamo=False,
             opset_version=OPSET,
             input_names=list(INPUTS),
-            output_names=list(network.names),
+            output_names=list(shapes),
             dynamic_axes=axes,
         )
         model = simplify(path)
-        shapes = {name: tuple(tensor.shape) for name, tensor in network.named(*inputs).items()}
     _declare_shapes(model, shapes, axes)
     return model
 
 
-def _dynamic_axes(names: Sequence[str], fixed: Fixed) -> dict[str, dict[int, str]]:
-    """Names of the dimensions that are not fixed; the tensors between stages have dimensions of their own."""
-    boundaries = {name: {0: "views", 2: f"{name}.height", 3: f"{name}.width"} for name in names if "." in name}
-    boundaries["encoder.neighbours"] = {0: "views", 1: "neighbours"}
+def _dynamic_axes(shapes: dict[str, tuple[int, ...]], fixed: Fixed) -> dict[str, dict[int, str]]:
+    """Names of the dimensions that are not fixed; the maps between stages have dimensions of their own."""
+    boundaries = {
+        name: {0: "views", 2: f"{name}.height", 3: f"{name}.width"}
+        if len(shape) == 4
+        else {0: "views", 1: "neighbours"}
+        for name, shape in shapes.items()
+        if "." in name
+    }
 
     def is_open(dimension: str) -> bool:
         depends_on_views = dimension in ("views", "neighbours", "gaussians")

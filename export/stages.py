@@ -1,124 +1,84 @@
-"""The stages as data: what each reads and yields, under the names that classes, files, manifest and report share."""
+"""The stages and the tensors that pass between them, under the names that classes, files, manifest and report share.
 
+A stage is an attribute of the network; `encoder.features_mv` is a field of what the stage `encoder` yields. Which of
+them a later stage reads is not written down anywhere: it is read off the traced graph, and so cannot go stale.
+"""
+
+from collections.abc import Iterable
 from dataclasses import dataclass
 
+import onnx
 import torch
 from torch import Tensor, nn
 
+from ..model.depthsplat import DepthSplat
+from ..model.gaussian_head import Predicted
 from ..model.idesplat import IDESplat
 from ..runtime.bundle import INPUTS, OUTPUTS
 
-CAMERAS = ("extrinsics", "intrinsics", "near", "far")
+LAST_STAGE = "gaussians"
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One part of the network between named tensors; `encoder.features_mv` is a field of what the encoder yields."""
+    """One part of the network between named tensors."""
 
     name: str
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
 
 
-IDESPLAT_STAGES = (
-    Stage(
-        "encoder",
-        ("images", "extrinsics"),
-        (
-            "encoder.neighbours",
-            "encoder.features_cnn",
-            "encoder.features_cnn_fine",
-            "encoder.features_mv",
-            "encoder.features_mono",
-            "encoder.mono_out",
-            "encoder.mono_disparity",
-        ),
-    ),
-    Stage(
-        "dpbu1",
-        (
-            "encoder.neighbours",
-            "encoder.features_cnn",
-            "encoder.features_mv",
-            "encoder.features_mono",
-            "encoder.mono_out",
-            "encoder.mono_disparity",
-            *CAMERAS,
-        ),
-        ("dpbu1.features", "dpbu1.context", "dpbu1.inverse_depth"),
-    ),
-    Stage(
-        "dpbu2",
-        (
-            "encoder.neighbours",
-            "encoder.features_cnn_fine",
-            "encoder.features_mono",
-            "encoder.mono_out",
-            "dpbu1.features",
-            "dpbu1.context",
-            "dpbu1.inverse_depth",
-            *CAMERAS,
-        ),
-        ("dpbu2.features", "dpbu2.context", "dpbu2.inverse_depth"),
-    ),
-    Stage(
-        "dpbu3",
-        (
-            "encoder.neighbours",
-            "encoder.features_cnn_fine",
-            "encoder.features_mono",
-            "encoder.mono_out",
-            "dpbu2.features",
-            "dpbu2.context",
-            "dpbu2.inverse_depth",
-            *CAMERAS,
-        ),
-        ("dpbu3.features", "dpbu3.inverse_depth", "dpbu3.probability", "dpbu3.candidates"),
-    ),
-    Stage(
-        "gaussians",
-        (
-            "images",
-            "encoder.features_cnn",
-            "dpbu1.context",
-            "dpbu1.inverse_depth",
-            "dpbu2.inverse_depth",
-            "dpbu3.features",
-            "dpbu3.inverse_depth",
-            "dpbu3.probability",
-            "dpbu3.candidates",
-            *CAMERAS,
-        ),
-        OUTPUTS,
-    ),
-)
-
-
 class NamedTensors(nn.Module):
-    """The network with every tensor that passes between stages as an output, under its name."""
+    """The network with everything that its stages yield as outputs, by name."""
 
-    def __init__(self, model: IDESplat) -> None:
+    def __init__(self, model: IDESplat | DepthSplat) -> None:
         super().__init__()
         self.model = model
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the outputs, in order."""
-        return tuple(name for stage in IDESPLAT_STAGES for name in stage.outputs)
-
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """The graph's inputs, as `INPUTS` names them -> tensors as `names` names them."""
-        named = self.named(*inputs)
-        return tuple(named[name] for name in self.names)
+        """The graph's inputs, as `INPUTS` names them -> the tensors of `named`, in its order."""
+        return tuple(self.named(*inputs).values())
 
     def named(self, *inputs: Tensor) -> dict[str, Tensor]:
-        """The same as `forward`, by name."""
-        parts = self.model.stages(*inputs)
-        predicted = parts[-1]
-        named = {"depth": predicted.depth, **predicted.gaussians._asdict()}
-        for stage, part in zip(IDESPLAT_STAGES[:-1], parts[:-1], strict=True):
-            named |= {f"{stage.name}.{field}": value for field, value in part._asdict().items()}
+        """The fields of every stage before the last, and the network's own outputs."""
+        named: dict[str, Tensor] = {}
+        stages = [name for name, _ in self.model.named_children()]
+        for stage, part in zip(stages, self.model.stages(*inputs), strict=True):
+            if isinstance(part, Predicted):
+                named |= {"depth": part.depth, **part.gaussians._asdict()}
+            else:
+                named |= {f"{stage}.{field}": value for field, value in part._asdict().items()}
         return named
+
+
+def find_stages(traced: onnx.ModelProto) -> list[Stage]:
+    """The stages of a traced graph in the order in which they run, each with what it reads and what is read of it."""
+    producers = {output: node for node in traced.graph.node for output in node.output}
+    named = [output.name for output in traced.graph.output]
+    fields: dict[str, list[str]] = {}
+    for name in named:
+        fields.setdefault(name.partition(".")[0] if "." in name else LAST_STAGE, []).append(name)
+    needed, stages = set(OUTPUTS), []
+    for stage, own in reversed(fields.items()):
+        outputs = [name for name in own if name in needed]
+        borders = {*INPUTS, *named} - set(own)
+        read = _reached(outputs, borders, producers)
+        stages.append(Stage(stage, tuple(name for name in (*INPUTS, *named) if name in read), tuple(outputs)))
+        needed |= read
+    return stages[::-1]
+
+
+def _reached(outputs: Iterable[str], borders: set[str], producers: dict[str, onnx.NodeProto]) -> set[str]:
+    """The border tensors that are met first on every way back from the outputs."""
+    met, seen, open_names = set(), set(), list(outputs)
+    while open_names:
+        name = open_names.pop()
+        if name in borders:
+            met.add(name)
+        elif name not in seen and name in producers:
+            seen.add(name)
+            open_names.extend(producers[name].input)
+    return met
 
 
 def example_inputs(views: int, height: int, width: int, near: float, far: float) -> dict[str, Tensor]:

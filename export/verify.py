@@ -10,7 +10,7 @@ import torch
 from ..runtime.bundle import OUTPUTS, Description
 from ..runtime.session import open_session, run_session
 from .exporter import Fixed, stage_graph
-from .stages import IDESPLAT_STAGES, NamedTensors, example_inputs
+from .stages import NamedTensors, example_inputs, find_stages
 
 # Errors are in standard deviations of the tensor. Within a stage both sides start from the same numbers; what is left
 # is float32 rounding, and the few pixels where a projection falls on the border of two and rounds to the other.
@@ -48,7 +48,7 @@ def verify(
             expected = {name: value.numpy() for name, value in network.named(*inputs.values()).items()}
         feeds = {**expected, **{name: value.numpy() for name, value in inputs.items()}}
         case = f"{views} views {height}x{width}"
-        for stage in IDESPLAT_STAGES:
+        for stage in find_stages(traced):
             session = open_session(stage_graph(traced, stage, description).SerializeToString())
             found = run_session(session, feeds)
             yield from _compare(case, stage.name, stage.outputs, found, expected, STAGE_TOLERANCE)

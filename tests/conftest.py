@@ -1,0 +1,90 @@
+"""A network of a tenth of the parameters, exported once, and photographs of a scene, drawn once."""
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from idesplat.model.config import (
+    PRESETS,
+    DPBUConfig,
+    DPTConfig,
+    FocusConfig,
+    IDESplatConfig,
+    UNetConfig,
+    ViTConfig,
+)
+from idesplat.model.idesplat import IDESplat
+
+SMALL_PRESET = "idesplat-small"
+SMALL = IDESplatConfig(
+    backbone_channels=(16, 24, 32),
+    feature_channels=32,
+    transformer_layers=2,
+    vit=ViTConfig(dim=48, depth=4, heads=3, grid=5, taps=(0, 1, 2, 3)),
+    dpt=DPTConfig(features=16, channels=(12, 24, 32, 48), disparity_channels=8),
+    dpbus=(
+        DPBUConfig(channels=64, candidates=33, scale=1, unet=UNetConfig(channels=32, levels=3)),
+        DPBUConfig(channels=16, candidates=17, scale=2, unet=UNetConfig(channels=16, levels=4)),
+        DPBUConfig(channels=8, candidates=9, scale=4, unet=UNetConfig(channels=8, levels=5)),
+    ),
+    residual_unet=UNetConfig(channels=8, levels=5),
+    focus=FocusConfig(channels=32, heads=4),
+    height=64,
+    width=96,
+)
+
+
+def small_network() -> IDESplat:
+    """The small network with weights that are always the same."""
+    torch.manual_seed(0)
+    return IDESplat(SMALL).eval()
+
+
+def run_command(main, *arguments) -> int:
+    """Call a console script's entry point as the shell would; its exit status."""
+    before = sys.argv
+    sys.argv = ["command", *map(str, arguments)]
+    try:
+        main()
+    except SystemExit as stop:
+        return stop.code or 0
+    finally:
+        sys.argv = before
+    return 0
+
+
+@pytest.fixture(scope="session")
+def presets():
+    """The small network as a preset, for as long as the tests run."""
+    PRESETS[SMALL_PRESET] = SMALL
+    yield
+    del PRESETS[SMALL_PRESET]
+
+
+@pytest.fixture(scope="session")
+def small_checkpoint(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("checkpoint") / "idesplat-small.pth"
+    torch.save(small_network().state_dict(), path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def exported(small_checkpoint, presets, tmp_path_factory) -> tuple[Path, Path]:
+    """The small network as a fused file and as a staged folder, through the command."""
+    from idesplat.export.cli import main
+
+    folder = tmp_path_factory.mktemp("exported")
+    fused, staged = folder / "model.onnx", folder / "staged"
+    assert run_command(main, small_checkpoint, fused, "--staged", staged) == 0
+    return fused, staged
+
+
+@pytest.fixture(scope="session")
+def scene(tmp_path_factory) -> Path:
+    """A folder with five photographs of a procedural room and transforms.json."""
+    from idesplat.tools.make_scene import make_scene
+
+    folder = tmp_path_factory.mktemp("scene")
+    make_scene(folder, seed=2, views=5, height=96, width=128)
+    return folder

@@ -1,0 +1,141 @@
+"""Loading checkpoints: strict, from every container, and never running what a pickle wants to run."""
+
+import os
+import pickle
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import SMALL, small_network
+from idesplat.model.checkpoint import (
+    UNUSED,
+    CheckpointError,
+    fill,
+    fitting_presets,
+    infer_preset,
+    load_idesplat,
+    read_state_dict,
+    rename_key,
+)
+from idesplat.model.config import PRESETS
+from reference_weights import draw_state_dict
+from safetensors.torch import save_file
+
+CASE = "idesplat-re10k-2v-256x256"
+
+
+@pytest.fixture(scope="module")
+def released():
+    """Tensors of a released checkpoint's keys and shapes, all on the meta device but for their shape."""
+    return {key: value.to("meta") for key, value in draw_state_dict(CASE).items()}
+
+
+@pytest.mark.parametrize("nest", (lambda d: d, lambda d: {"state_dict": d, "epoch": 3}, lambda d: {"model": d}))
+def test_containers(tmp_path, nest):
+    tensors = small_network().state_dict()
+    path = tmp_path / "weights.ckpt"
+    torch.save(nest(tensors), path)
+    loaded = load_idesplat(path, SMALL).state_dict()
+    assert all(torch.equal(loaded[key], value) for key, value in tensors.items())
+
+
+def test_safetensors(tmp_path):
+    path = tmp_path / "weights.safetensors"
+    save_file(small_network().state_dict(), path)
+    assert load_idesplat(path, SMALL)
+
+
+def test_released_files_lose_their_prefix_and_what_belongs_to_the_loss(tmp_path):
+    ours, loss = {"encoder.depth_predictor.conv_mv.bias": torch.zeros(2)}, {"losses.lpips.weight": torch.zeros(3)}
+    torch.save({"state_dict": {**ours, **loss}}, tmp_path / "weights.ckpt")
+    assert list(read_state_dict(tmp_path / "weights.ckpt")) == ["depth_predictor.conv_mv.bias"]
+
+
+def test_released_keys_cover_the_network(released):
+    assert set(fitting_presets(released)) == {"idesplat-re10k", "idesplat-acid", "idesplat-dl3dv"}
+
+
+@pytest.mark.parametrize("name", ("re10k", "acid", "dl3dv"))
+def test_the_file_name_decides_between_presets_of_one_shape(released, name):
+    assert infer_preset(Path(f"idesplat-{name}-256x256-view2.ckpt"), released) == f"idesplat-{name}"
+
+
+def test_an_ambiguous_file_lists_the_presets_that_fit(released):
+    with pytest.raises(CheckpointError, match=r"idesplat-re10k, idesplat-acid, idesplat-dl3dv.*--preset"):
+        infer_preset(Path("mine.ckpt"), released)
+
+
+def test_names_are_mapped_one_to_one(released):
+    used = [key for key in released if not UNUSED.search(key)]
+    assert len({rename_key(key) for key in used}) == len(used)
+
+
+def test_a_missing_an_unknown_and_a_misshapen_tensor_are_named():
+    model = small_network()
+    tensors = model.state_dict()
+    del tensors["encoder.backbone.conv1.weight"]
+    tensors["encoder.new.weight"] = torch.zeros(1)
+    tensors["gaussians.head1.bias"] = torch.zeros(5)
+    with pytest.raises(CheckpointError) as error:
+        fill(model, tensors, Path("file.pth"))
+    message = str(error.value)
+    for part in (
+        "file.pth",
+        "encoder.backbone.conv1.weight is missing",
+        "encoder.new.weight is unknown",
+        "gaussians.head1.bias",
+    ):
+        assert part in message
+    assert "\n" not in message
+
+
+def test_a_transposed_tensor_is_refused():
+    model = small_network()
+    tensors = {k: v.T if k == "encoder.transformer.layers.0.mlp1.weight" else v for k, v in model.state_dict().items()}
+    with pytest.raises(CheckpointError, match=r"mlp1\.weight has shape"):
+        fill(model, tensors, Path("file.pth"))
+
+
+class Harmful:
+    """Would create a file if it were unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.path),)
+
+
+@pytest.mark.parametrize("write", (torch.save, lambda content, path: path.write_bytes(pickle.dumps(content))))
+def test_a_pickle_that_runs_code_is_refused_with_an_explanation(tmp_path, write):
+    write({"state_dict": Harmful(tmp_path / "harm")}, tmp_path / "evil.ckpt")
+    with pytest.raises(CheckpointError, match=r"evil\.ckpt.*any code") as error:
+        read_state_dict(tmp_path / "evil.ckpt")
+    assert not (tmp_path / "harm").exists()
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", ("broken.ckpt", "broken.pth", "broken.safetensors"))
+@pytest.mark.parametrize("content", (b"", b"not a checkpoint", b"PK\x03\x04" + bytes(64)))
+def test_unreadable_files_are_named(tmp_path, name, content):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(CheckpointError, match=name) as error:
+        read_state_dict(tmp_path / name)
+    assert "\n" not in str(error.value)
+
+
+def test_a_missing_file_and_a_file_without_tensors(tmp_path):
+    with pytest.raises(CheckpointError, match="no such file"):
+        read_state_dict(tmp_path / "none.ckpt")
+    torch.save({"epoch": 3}, tmp_path / "empty.ckpt")
+    with pytest.raises(CheckpointError, match="no tensors"):
+        read_state_dict(tmp_path / "empty.ckpt")
+
+
+def test_every_preset_can_be_told_from_its_released_name(released):
+    """Names as the releases write them; only IDESplat's shapes are held here."""
+    assert [name for name in PRESETS if name.startswith("idesplat-")][:3] == [
+        "idesplat-re10k",
+        "idesplat-acid",
+        "idesplat-dl3dv",
+    ]

@@ -1,0 +1,175 @@
+"""The exported files: standard, self-describing, dynamic, and equal to the network."""
+
+import json
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from conftest import SMALL, SMALL_PRESET, run_command, small_network
+from idesplat.export import cli
+from idesplat.export.stages import example_inputs
+from idesplat.export.verify import Parity
+from idesplat.runtime.bundle import INPUTS, OUTPUTS, read_description, read_manifest
+from idesplat.runtime.runner import Runner
+
+STAGES = ["encoder", "dpbu1", "dpbu2", "dpbu3", "gaussians"]
+
+
+def test_graph_is_standard_and_passes_the_checker(exported):
+    fused, staged = exported
+    for path in (fused, *(staged / f"{stage}.onnx" for stage in STAGES)):
+        model = onnx.load(path)
+        onnx.checker.check_model(model, full_check=True)
+        assert [(opset.domain, opset.version) for opset in model.opset_import] == [("", 20)]
+        assert {node.domain for node in model.graph.node} == {""}
+        assert model.ir_version == 10
+        assert not model.functions
+
+
+def test_inputs_and_outputs(exported):
+    graph = onnx.load(exported[0]).graph
+
+    def shape(value):
+        return [dim.dim_param or dim.dim_value for dim in value.type.tensor_type.shape.dim]
+
+    assert {value.name: shape(value) for value in graph.input} == {
+        "images": ["views", 3, "height", "width"],
+        "extrinsics": ["views", 4, 4],
+        "intrinsics": ["views", 3, 3],
+        "near": ["views"],
+        "far": ["views"],
+    }
+    assert {value.name: shape(value) for value in graph.output} == {
+        "depth": ["views", "height", "width"],
+        "means": ["gaussians", 3],
+        "scales": ["gaussians", 3],
+        "quats": ["gaussians", 4],
+        "opacities": ["gaussians"],
+        "sh": ["gaussians", 9, 3],
+    }
+    assert [value.name for value in graph.input] == list(INPUTS)
+    assert [value.name for value in graph.output] == list(OUTPUTS)
+
+
+def test_description(exported, small_checkpoint):
+    import hashlib
+
+    properties = {entry.key: entry.value for entry in onnx.load(exported[0]).metadata_props}
+    description = read_description(properties, exported[0])
+    assert description.preset == SMALL_PRESET
+    assert (description.near, description.far, description.sh_degree) == (0.5, 100.0, 2)
+    assert (description.height, description.width, description.size_multiple) == (64, 96, 16)
+    assert description.checkpoint_sha256 == hashlib.sha256(small_checkpoint.read_bytes()).hexdigest()
+    assert not description.fixed_size
+    assert not description.fixed_views
+
+
+@pytest.mark.parametrize(("views", "height", "width"), ((2, 64, 96), (3, 128, 64), (4, 64, 64), (5, 80, 112)))
+def test_one_file_serves_every_number_of_views_and_size(exported, views, height, width):
+    inputs = example_inputs(views, height, width, 0.5, 100.0)
+    with torch.no_grad():
+        expected = small_network()(*inputs.values())
+    found = Runner(exported[0]).predict_arrays(*(inputs[name].numpy() for name in INPUTS[:3]))
+    for name, value in {"depth": expected.depth, **expected.gaussians._asdict()}.items():
+        ours = found.depth if name == "depth" else getattr(found.gaussians, name)
+        assert ours.shape == tuple(value.shape)
+        # A pixel whose projection falls on a border may see the other side, so the median is what must be small.
+        assert np.median(np.abs(ours - value.numpy())) < 1e-4 * value.std()
+
+
+def test_staged_folder_gives_what_the_fused_file_gives(exported):
+    fused, staged = exported
+    inputs = example_inputs(3, 64, 96, 0.5, 100.0)
+    arrays = [inputs[name].numpy() for name in INPUTS[:3]]
+    whole, parts = Runner(fused).predict_arrays(*arrays), Runner(staged).predict_arrays(*arrays)
+    assert list(parts.seconds) == STAGES
+    np.testing.assert_allclose(parts.depth, whole.depth, rtol=1e-4)
+    np.testing.assert_allclose(parts.gaussians.sh, whole.gaussians.sh, atol=1e-3)
+
+
+def test_manifest_names_the_networks_own_stages(exported):
+    stages = read_manifest(exported[1])
+    assert [stage.name for stage in stages] == STAGES
+    assert STAGES == [name for name, _ in small_network().named_children()]
+    for stage in stages:
+        model = onnx.load(exported[1] / stage.file)
+        assert [value.name for value in model.graph.input] == stage.inputs
+        assert [value.name for value in model.graph.output] == stage.outputs
+
+
+def test_fixed_views_and_size(small_checkpoint, presets, tmp_path, capsys):
+    out = tmp_path / "fixed.onnx"
+    assert run_command(cli.main, small_checkpoint, out, "--views", 2, "--size", "64x64") == 0
+    shapes = {
+        value.name: [dim.dim_value for dim in value.type.tensor_type.shape.dim] for value in onnx.load(out).graph.input
+    }
+    assert shapes["images"] == [2, 3, 64, 64]
+    runner = Runner(out)
+    inputs = example_inputs(3, 64, 64, 0.5, 100.0)
+    with pytest.raises(ValueError, match="2 views and got 3"):
+        runner.predict_arrays(*(inputs[name].numpy() for name in INPUTS[:3]))
+    assert "fixed.onnx" in capsys.readouterr().out
+
+
+def test_a_departing_graph_leaves_no_file(small_checkpoint, presets, tmp_path, monkeypatch, capsys):
+    breach = Parity("2 views", "encoder", "encoder.features_mv", 3.0, 1.0, 1e-3)
+    monkeypatch.setattr("idesplat.export.verify.verify", lambda *_: iter([breach]))
+    out, staged = tmp_path / "model.onnx", tmp_path / "staged"
+    assert run_command(cli.main, small_checkpoint, out, "--staged", staged) == 1
+    assert list(tmp_path.iterdir()) == []
+    assert "DEPARTS" in capsys.readouterr().out
+
+
+def test_verification_notices_a_wrong_graph(exported, small_checkpoint):
+    """The very comparison that guards the export fails when the weights differ by one part in ten of one tensor."""
+    from idesplat.export.exporter import Fixed, fused_graph, trace
+    from idesplat.export.stages import NamedTensors
+    from idesplat.export.verify import verify
+
+    network = NamedTensors(small_network())
+    traced = trace(network, 0.5, 100.0, SMALL.size_multiple, Fixed())
+    properties = {entry.key: entry.value for entry in onnx.load(exported[0]).metadata_props}
+    description = read_description(properties, exported[0])
+    fused = fused_graph(traced, description).SerializeToString()
+    with torch.no_grad():
+        network.model.dpbu1.merge.conv.weight *= 1.1
+    rows = list(verify(network, traced, fused, description, Fixed()))
+    assert "dpbu1" in {row.stage for row in rows if not row.passed}
+    assert not {row.stage for row in rows if not row.passed} & {"encoder", "dpbu2", "dpbu3", "gaussians"}
+
+
+ERRORS = {
+    "missing": (["none.ckpt", "out.onnx"], "no such file"),
+    "no output": (["weights.pth"], "nothing to write"),
+    "wrong suffix": (["weights.pth", "out.bin"], "must end in .onnx"),
+    "no folder": (["weights.pth", "nowhere/out.onnx"], "cannot write into nowhere"),
+    "unknown preset": (["weights.pth", "out.onnx", "--preset", "nonsense"], "choose one of"),
+    "does not fit": (["weights.pth", "out.onnx", "--preset", "idesplat-re10k"], "does not fit"),
+    "not a checkpoint": (["text.pth", "out.onnx"], "text.pth"),
+    "bad size": (["weights.pth", "out.onnx", "--size", "64"], "HEIGHTxWIDTH"),
+    "size not a multiple": (["weights.pth", "out.onnx", "--size", "64x70"], "multiples of 16"),
+    "staged is a file": (["weights.pth", "--staged", "text.pth"], "is a file"),
+    "staged holds other files": (["weights.pth", "--staged", "."], "holds other files"),
+}
+
+
+@pytest.mark.parametrize("name", ERRORS)
+def test_errors_are_one_line(name, small_checkpoint, presets, tmp_path, monkeypatch, capsys):
+    arguments, expected = ERRORS[name]
+    (tmp_path / "weights.pth").write_bytes(small_checkpoint.read_bytes())
+    (tmp_path / "text.pth").write_text("hello")
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.iterdir())
+    assert run_command(cli.main, *arguments) == 2
+    message = capsys.readouterr().err
+    assert message.startswith("error: ")
+    assert expected in message
+    assert message.count("\n") == 1
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_metadata_of_another_layout_is_refused(tmp_path):
+    content = json.dumps({"layout": 99})
+    with pytest.raises(ValueError, match="layout 99, expected 1"):
+        read_description({"idesplat": content}, tmp_path)
