@@ -57,10 +57,9 @@ def read_state_dict(path: Path) -> dict[str, Tensor]:
     if not isinstance(content, dict):
         raise CheckpointError(f"{path}: holds a {type(content).__name__}, expected a state dict; is it a checkpoint?")
     tensors = {key: value for key, value in content.items() if isinstance(value, Tensor)}
-    # Released files alone have a depth predictor; this project's own have a stage called encoder.
-    if any(
-        key.startswith(PREFIX + DEPTH_PREFIX) for key in tensors
-    ):  # other prefixes belong to the loss and are not ours
+    # Released files alone have a depth predictor; this project's own have a stage called encoder. Other prefixes belong
+    # to the loss and are not ours.
+    if any(key.startswith(PREFIX + DEPTH_PREFIX) for key in tensors):
         tensors = {key.removeprefix(PREFIX): value for key, value in tensors.items() if key.startswith(PREFIX)}
     if not tensors:
         raise CheckpointError(f"{path}: holds no tensors, expected a state dict; is it a checkpoint?")
