@@ -1,6 +1,6 @@
 """What training asks of each stage: inverse depth, its gradients and probabilities, and rendered novel views."""
 
-import warnings
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -47,13 +47,13 @@ def coarse_bin(config: IDESplatConfig, near: Tensor, far: Tensor) -> Tensor:
 
 
 def inverse_depth_loss(predicted: Tensor, truth: Tensor, bins: Tensor) -> Tensor:
-    """|1/D - 1/D*| in candidates and relative to 1/D*, and its gradient's error along x and y.
+    """|1/D - 1/D*| in candidates, |log D - log D*|, and |1/D - 1/D*|'s gradient along x and y.
 
     predicted, truth: inverse depth [views, 1, h, w]. bins: [views, 1, 1, 1].
     """
     error = (predicted - truth).abs()
     absolute = softened(error / bins, LARGE_BINS)
-    relative = softened(error / truth, LARGE_RELATIVE)
+    relative = softened((predicted.clamp(min=TINY).log() - truth.log()).abs(), LARGE_RELATIVE)
     loss = absolute.mean() + RELATIVE_SHARE * relative.mean()
     for axis in (2, 3):
         step = (predicted.diff(dim=axis) - truth.diff(dim=axis)).abs() / bins
@@ -110,11 +110,11 @@ def load_perceptual() -> Perceptual | None:
     try:
         import lpips
     except ImportError:
-        warnings.warn("LPIPS is left out of the loss: the package lpips is not installed", stacklevel=2)
+        print("warning: LPIPS is left out of the loss, since the package lpips is not installed", file=sys.stderr)
         return None
     weights = Path(torch.hub.get_dir()) / "checkpoints" / VGG_WEIGHTS
     if not weights.is_file():
-        warnings.warn(f"LPIPS is left out of the loss: VGG16's weights are not at {weights}", stacklevel=2)
+        print(f"warning: LPIPS is left out of the loss, since VGG16's weights are not at {weights}", file=sys.stderr)
         return None
     network = lpips.LPIPS(net="vgg", verbose=False).requires_grad_(False)
     return lambda rendered, truth: network(rendered, truth, normalize=True).mean()

@@ -5,13 +5,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from ..model.checkpoint import CheckpointError, fill, read_state_dict
 from ..model.config import IDESplatConfig
 from ..model.idesplat import IDESplat
 from ..runtime.errors import InputError
 from ..runtime.files import replacing
+from .initialisation import new_model
 
 # The running mean forgets at this rate, and faster in the beginning.
 MEAN_DECAY = 0.995
@@ -105,15 +106,3 @@ class TrainingState:
         self.optimizer.load_state_dict(training["optimizer"])
         self.mean = content["state_dict"]
         self.step = training["step"]
-
-
-def new_model(config: IDESplatConfig, seed: int) -> IDESplat:
-    """A network with weights drawn from `seed`."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        model = IDESplat(config)
-    # The monocular disparity is one over this layer's output: it must start away from zero.
-    bias = model.encoder.dpt.disparity3.bias
-    assert isinstance(bias, Tensor)
-    nn.init.ones_(bias)
-    return model

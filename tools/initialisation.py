@@ -1,0 +1,82 @@
+"""Weights of a new network that match from the first step on.
+
+Drawn at random, the projections compare unlike features and the U-Nets forget which candidate a correlation belongs to,
+and training first has to find both. Here queries and keys start with the same projection, and each regulariser starts
+as a smoothing of the correlations along the candidates, to which it learns to add. The architecture stays as it is.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from ..model.config import IDESplatConfig
+from ..model.epipolar_attention import EpipolarAttention
+from ..model.idesplat import IDESplat
+from ..model.mv_transformer import TransformerBlock, WindowAttention
+from ..model.unet import CostRegulariser, ResBlock
+
+# By how much a correlation of one deviation raises a candidate's logit, about.
+TEMPERATURE = 2.0
+# What remains of random weights beside the anchored ones.
+NOISE = 0.2
+# How much each of the multi-view transformer's messages first adds to the features that are matched.
+MESSAGE = 0.1
+
+
+def new_model(config: IDESplatConfig, seed: int) -> IDESplat:
+    """A network with weights drawn from `seed`."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        model = IDESplat(config)
+    for part in model.modules():
+        if isinstance(part, EpipolarAttention):
+            _tie_keys(part)
+            _anchor(part.regulariser, first=1)
+        elif isinstance(part, TransformerBlock | WindowAttention):
+            nn.init.constant_(part.norm.weight, MESSAGE)
+    _anchor(model.gaussians.residual, first=config.dpbus[2].channels)
+    # The monocular disparity is one over this layer's output: it must start away from zero.
+    bias = model.encoder.dpt.disparity3.bias
+    assert bias is not None
+    nn.init.ones_(bias)
+    return model
+
+
+@torch.no_grad()
+def _tie_keys(layer: EpipolarAttention) -> None:
+    """Queries and keys alike: a pixel's inner product is largest with what looks the same."""
+    for projection in (layer.q_proj, layer.k_proj):
+        nn.init.eye_(projection.weight)
+        nn.init.zeros_(projection.bias)
+
+
+@torch.no_grad()
+def _anchor(regulariser: CostRegulariser, first: int) -> None:
+    """Pass the candidates, input channels from `first` on, through the regulariser's own width to the logits."""
+    unet = regulariser.unet
+    channels, candidates = unet.conv_in.weight.shape[0], regulariser.conv_out.weight.shape[0]
+    hats = _hats(channels, candidates)
+    _centre(regulariser.conv_in, hats / hats.sum(1, keepdim=True), first)
+    _centre(unet.conv_in, torch.eye(channels), 0)
+    # The last block's shortcut reads what came up, then the U-Net's first map, which is the one to hand on.
+    last_block = unet.up_blocks[-1]
+    assert isinstance(last_block, ResBlock) and isinstance(last_block.shortcut, nn.Conv2d)
+    _centre(last_block.shortcut, torch.eye(channels), channels)
+    nn.init.zeros_(last_block.conv2.weight)
+    _centre(unet.conv_out, torch.eye(channels), 0)
+    _centre(regulariser.conv_out, TEMPERATURE * hats.T / hats.sum(0)[:, None], 0)
+
+
+def _hats(channels: int, candidates: int) -> Tensor:
+    """Overlapping triangles that share the candidates among the channels, [channels, candidates]."""
+    centres = torch.linspace(0, candidates - 1, channels)
+    width = max(1.0, (candidates - 1) / (channels - 1))
+    return (1 - (torch.arange(candidates) - centres[:, None]).abs() / width).clamp(min=0)
+
+
+def _centre(convolution: nn.Conv2d, matrix: Tensor, first: int) -> None:
+    """Make `matrix` the convolution's middle tap, for the input channels from `first` on, with little noise around."""
+    convolution.weight.mul_(NOISE)
+    middle = convolution.weight.shape[2] // 2
+    convolution.weight[:, first : first + matrix.shape[1], middle, middle] += matrix
+    if convolution.bias is not None:
+        convolution.bias.zero_()
