@@ -24,5 +24,9 @@ check: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy -p idesplat.model -p idesplat.export -p idesplat.runtime -p idesplat.tools
 
+# Photographs of a drawn room to a splat, in demo/.
+demo: setup
+	$(BIN)/python -m idesplat.tools.demo demo
+
 clean:
 	rm -rf $(VENV) build .typing *.egg-info

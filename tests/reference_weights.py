@@ -1,4 +1,4 @@
-"""The reference cases' weights, which anyone can draw again: a tensor depends on its key, shape, seed and gain alone."""
+"""The reference cases' weights, which anyone can draw again: a tensor depends on its key, shape, seed and gain."""
 
 import json
 import zlib

@@ -91,7 +91,7 @@ def test_staged_folder_gives_what_the_fused_file_gives(exported):
 def test_manifest_names_the_networks_own_stages(exported):
     stages = read_manifest(exported[1])
     assert [stage.name for stage in stages] == STAGES
-    assert STAGES == [name for name, _ in small_network().named_children()]
+    assert [name for name, _ in small_network().named_children()] == STAGES
     for stage in stages:
         model = onnx.load(exported[1] / stage.file)
         assert [value.name for value in model.graph.input] == stage.inputs

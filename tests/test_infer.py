@@ -1,0 +1,154 @@
+"""The command idesplat-infer, as a user meets it: results, and one line for everything that is wrong."""
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from conftest import run_command
+from idesplat.runtime.cli import main
+from idesplat.runtime.ply import read_ply
+from idesplat.runtime.render import main as render_main
+
+
+@pytest.fixture
+def workplace(scene, exported, tmp_path, monkeypatch):
+    """A folder of one's own with the photographs, their cameras and the model, and we stand in it."""
+    shutil.copytree(scene / "images", tmp_path / "images")
+    shutil.copy(scene / "transforms.json", tmp_path)
+    shutil.copy(exported[0], tmp_path / "model.onnx")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+USUAL = ("--images", "images", "--cameras", "transforms.json", "--model", "model.onnx", "--out", "scene.ply")
+
+
+def test_everything_it_can_write(workplace, capsys):
+    extras = ("--save-depth", "depth", "--render", "views", "--timings", "--json", "summary.json", "--views", "3")
+    assert run_command(main, *USUAL, *extras) == 0
+    gaussians = read_ply(Path("scene.ply"))
+    assert len(gaussians) == 3 * 64 * 96
+    assert gaussians.sh_degree == 2
+    summary = json.loads(Path("summary.json").read_text())
+    assert summary["gaussians"] == len(gaussians)
+    assert len(summary["views"]) == 3
+    assert summary["model"]["preset"] == "idesplat-small"
+    assert (summary["near"], summary["far"]) == (0.5, 100.0)
+    depths = sorted(Path("depth").glob("*.npz"))
+    assert len(depths) == len(list(Path("depth").glob("*.png"))) == 3
+    with np.load(depths[0]) as file:
+        assert file["depth"].shape == (64, 96)
+        assert np.isfinite(file["depth"]).all()
+    assert len(list(Path("views").glob("view-*.png"))) == 3
+    frames = sorted(Path("views").glob("path-*.png"))
+    assert len(frames) == 24
+    assert cv2.imread(str(frames[0])).shape == (64, 96, 3)
+    printed = capsys.readouterr().out
+    for text in ("wrote scene.ply", "wrote summary.json", "3 of 5 photographs", "idesplat-render scene.ply", "total"):
+        assert text in printed
+
+
+def test_staged_folder_and_a_list_of_files(workplace, exported):
+    files = sorted(Path("images").iterdir())[:2]
+    arguments = ("--images", *files, "--cameras", "transforms.json", "--model", exported[1], "--out", "scene.ply")
+    assert run_command(main, *arguments) == 0
+    assert len(read_ply(Path("scene.ply"))) == 2 * 64 * 96
+
+
+def test_portrait_photographs_and_another_size(workplace):
+    assert run_command(main, *USUAL, "--size", "96x64", "--near", "1", "--far", "20") == 0
+    assert len(read_ply(Path("scene.ply"))) == 2 * 96 * 64
+
+
+def test_what_it_writes_can_be_rendered(workplace):
+    assert run_command(main, *USUAL) == 0
+    assert run_command(render_main, "scene.ply", "--cameras", "transforms.json", "--out", "drawn") == 0
+    names = {path.stem for path in Path("images").iterdir()}
+    assert {path.stem for path in Path("drawn").glob("*.png")} == names
+
+
+def change_cameras(edit):
+    def change():
+        content = json.loads(Path("transforms.json").read_text())
+        edit(content)
+        Path("transforms.json").write_text(json.dumps(content))
+
+    return change
+
+
+def nothing():
+    pass
+
+
+def without_fields(content, *names):
+    for name in names:
+        content.pop(name, None)
+
+
+BAD = {
+    "missing image folder": (nothing, ("--images", "nowhere"), "nowhere"),
+    "unreadable image": (lambda: Path("images/000.png").write_bytes(b"not a picture"), (), "000.png"),
+    "empty image": (lambda: Path("images/000.png").write_bytes(b""), (), "000.png"),
+    "corrupt JSON": (lambda: Path("transforms.json").write_text('{"frames": ['), (), "transforms.json"),
+    "missing cameras": (nothing, ("--cameras", "none.json"), "none.json"),
+    "missing pose": (change_cameras(lambda c: c["frames"][0].pop("transform_matrix")), (), "transform_matrix"),
+    "pose of zeros": (
+        change_cameras(lambda c: c["frames"][0].update(transform_matrix=[[0.0] * 4] * 4)),
+        (),
+        "transform_matrix",
+    ),
+    "NaN in a pose": (
+        change_cameras(lambda c: c["frames"][0]["transform_matrix"][0].__setitem__(3, float("nan"))),
+        (),
+        "transform_matrix",
+    ),
+    "zero focal length": (change_cameras(lambda c: c.update(fl_x=0)), (), "fl_x"),
+    "negative focal length": (change_cameras(lambda c: c.update(fl_y=-300)), (), "fl_y"),
+    "one photograph": (lambda: [path.unlink() for path in sorted(Path("images").iterdir())[1:]], (), "at least 2"),
+    "two identical cameras": (
+        change_cameras(
+            lambda c: [frame.update(transform_matrix=c["frames"][0]["transform_matrix"]) for frame in c["frames"]]
+        ),
+        (),
+        "camera",
+    ),
+    "more images than cameras": (change_cameras(lambda c: c["frames"].pop()), (), "004"),
+    "a size it cannot take": (nothing, ("--size", "64x50"), "multiples of 16"),
+    "a size that is none": (nothing, ("--size", "large"), "HEIGHTxWIDTH"),
+    "near behind far": (nothing, ("--near", "5", "--far", "2"), "near < far"),
+    "near behind the model's far": (nothing, ("--near", "200"), "near"),
+    "NaN near": (nothing, ("--near", "nan"), "--near"),
+    "a model that is not ours": (lambda: Path("model.onnx").write_bytes(b"hello"), (), "model.onnx"),
+    "no model": (lambda: Path("model.onnx").unlink(), (), "model.onnx"),
+    "an unknown provider": (nothing, ("--provider", "Abacus"), "Abacus"),
+    "a provider that is not installed": (nothing, ("--provider", "CUDA"), "CUDA"),
+    "an output folder that is not there": (nothing, ("--out", "nowhere/scene.ply"), "nowhere"),
+    "an output that is no splat file": (nothing, ("--out", "scene.txt"), ".ply"),
+    "an output folder that is a file": (nothing, ("--save-depth", "transforms.json"), "transforms.json"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_input_is_one_line_and_leaves_nothing(workplace, capfd, name):
+    spoil, arguments, expected = BAD[name]
+    spoil()
+    Path("scene.ply").write_bytes(b"the result of yesterday")
+    before = {path: path.stat().st_mtime_ns for path in workplace.rglob("*")}
+    options = dict(zip(USUAL[::2], USUAL[1::2], strict=True)) | dict(zip(arguments[::2], arguments[1::2], strict=True))
+    assert run_command(main, *(part for option in options.items() for part in option)) == 2
+    lines = [line for line in capfd.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert len(lines) == 1
+    assert expected in lines[0]
+    assert {path: path.stat().st_mtime_ns for path in workplace.rglob("*")} == before
+
+
+@pytest.mark.skipif(
+    not hasattr(__import__("os"), "geteuid") or __import__("os").geteuid() == 0, reason="root may write anywhere"
+)
+def test_an_unwritable_folder_is_refused(workplace, capsys):
+    Path("locked").mkdir(mode=0o500)
+    assert run_command(main, *USUAL[:-1], "locked/scene.ply") == 2
+    assert "cannot write into locked" in capsys.readouterr().err

@@ -1,0 +1,168 @@
+"""The runner as a library, and the rules between the packages."""
+
+import ast
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from idesplat.export.stages import example_inputs
+from idesplat.runtime import InputError, Runner, read_cameras
+from idesplat.runtime.bundle import INPUTS
+from idesplat.runtime.images import load_image
+from idesplat.runtime.session import open_session, provider_name
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="module")
+def runner(exported):
+    return Runner(exported[0])
+
+
+@pytest.fixture
+def arrays():
+    inputs = example_inputs(2, 64, 64, 0.5, 100.0)
+    return {name: inputs[name].numpy().copy() for name in INPUTS[:3]}
+
+
+def test_predict_takes_photographs_and_cameras(runner, scene):
+    cameras = read_cameras(scene / "transforms.json")[:2]
+    from_files = runner.predict([scene / camera.name for camera in cameras], cameras)
+    from_arrays = runner.predict([load_image(scene / camera.name) for camera in cameras], cameras)
+    assert from_files.depth.shape == (2, 64, 96)
+    assert len(from_files.gaussians) == 2 * 64 * 96
+    np.testing.assert_array_equal(from_files.depth, from_arrays.depth)
+
+
+def test_near_and_far_bound_the_depth(runner, arrays):
+    depth = runner.predict_arrays(**arrays, near=2, far=5).depth
+    assert depth.min() >= 2 * (1 - 1e-5)
+    assert depth.max() <= 5 * (1 + 1e-5)
+
+
+def spoil(name, index, value):
+    def change(arrays):
+        arrays[name][index] = value
+
+    return change
+
+
+BAD_ARRAYS = {
+    "NaN in the images": (spoil("images", (0, 0, 0, 0), np.nan), "images"),
+    "NaN in a pose": (spoil("extrinsics", (1, 0, 3), np.nan), "extrinsics"),
+    "NaN in the intrinsics": (spoil("intrinsics", (0, 0, 0), np.nan), "intrinsics"),
+    "zero focal length": (spoil("intrinsics", (0, 0, 0), 0), "intrinsics"),
+    "mirrored pose": (spoil("extrinsics", (1, slice(None), 0), [-1, 0, 0, 0]), "extrinsics"),
+    "pixels of 255": (spoil("images", 0, 255), "0 to 1"),
+    "one view": (lambda arrays: arrays.update({k: v[:1] for k, v in arrays.items()}), "at least 2"),
+    "same camera twice": (lambda arrays: arrays["extrinsics"].__setitem__(1, arrays["extrinsics"][0]), "same"),
+    "counts that differ": (lambda arrays: arrays.update(extrinsics=arrays["extrinsics"][:1]), "extrinsics"),
+    "a size it cannot take": (lambda arrays: arrays.update(images=arrays["images"][..., :50]), "multiples of 16"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_ARRAYS)
+def test_bad_arrays_are_refused(runner, arrays, name):
+    change, expected = BAD_ARRAYS[name]
+    change(arrays)
+    with pytest.raises(InputError, match=expected) as error:
+        runner.predict_arrays(**arrays)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("near", "far"), ((5, 2), (2, 2), (0, 2), (-1, 2), (np.nan, 2)))
+def test_near_must_be_before_far(runner, arrays, near, far):
+    with pytest.raises(InputError, match="near"):
+        runner.predict_arrays(**arrays, near=near, far=far)
+
+
+def test_a_provider_that_is_not_there_is_refused():
+    with pytest.raises(InputError, match="CUDA is not installed; this ONNX Runtime offers"):
+        provider_name("CUDA")
+
+
+def test_a_silent_fallback_is_refused(exported, monkeypatch):
+    """ONNX Runtime drops a provider whose libraries are missing with no more than a warning."""
+    with pytest.raises(InputError, match="fell back to CPUExecutionProvider"):
+        open_session(exported[0], "NoSuchExecutionProvider")
+
+
+def test_models_that_are_not_ours_are_refused(tmp_path, exported):
+    other = onnx.load(exported[0])
+    del other.metadata_props[:]
+    onnx.save(other, tmp_path / "other.onnx")
+    with pytest.raises(InputError, match=r"other\.onnx: not a model of this project"):
+        Runner(tmp_path / "other.onnx")
+    (tmp_path / "text.onnx").write_text("hello")
+    with pytest.raises(InputError, match=r"text\.onnx: ONNX Runtime cannot load it"):
+        Runner(tmp_path / "text.onnx")
+    with pytest.raises(InputError, match="no such model"):
+        Runner(tmp_path / "none.onnx")
+    with pytest.raises(InputError, match=r"no manifest\.json"):
+        Runner(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "content",
+    ("", "[]", "{}", '{"stages": [{}]}', '{"stages": [{"name": "a", "file": "../x", "inputs": [], "outputs": []}]}'),
+)
+def test_damaged_manifests_are_refused(tmp_path, content):
+    (tmp_path / "manifest.json").write_text(content)
+    with pytest.raises(InputError, match=r"manifest\.json"):
+        Runner(tmp_path)
+
+
+# ---- rules between the packages
+
+
+def imports_of(path: Path) -> set[str]:
+    """Packages that a file imports, ours as `..name`."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name.partition(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            found.add("." * node.level + (node.module or "").partition(".")[0])
+    return found
+
+
+@pytest.mark.parametrize(
+    ("package", "forbidden"),
+    (
+        ("runtime", {"torch", "onnx", "..model", "..export", "..tools"}),
+        ("model", {"onnx", "onnxruntime", "..runtime", "..export", "..tools"}),
+        ("export", {"..tools"}),
+    ),
+)
+def test_packages_keep_their_boundaries(package, forbidden):
+    for path in (ROOT / package).glob("*.py"):
+        assert not imports_of(path) & forbidden, path
+
+
+def test_running_a_model_never_loads_torch(exported, scene, tmp_path):
+    code = (
+        "import sys; from idesplat.runtime.cli import main; main(); "
+        "assert not {'torch', 'onnx'} & set(sys.modules), 'loaded'"
+    )
+    arguments = ["--images", scene / "images", "--cameras", scene / "transforms.json", "--model", exported[0]]
+    command = [sys.executable, "-c", code, *map(str, [*arguments, "--out", tmp_path / "scene.ply"])]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "scene.ply").is_file()
+
+
+def test_every_folder_with_code_is_packaged():
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    folders = {f"idesplat.{path.parent.name}" for path in ROOT.glob("*/__init__.py") if path.parent.name != "tests"}
+    assert set(settings["packages"]) == folders
+    assert settings["package-dir"] == {"idesplat": "."}
+    assert not list(ROOT.glob("[mert]*/*/__init__.py"))  # packages stay flat: a nested one would miss the wheel
+
+
+def test_nothing_generic_becomes_importable(tmp_path):
+    code = "import importlib.util as u; assert not any(u.find_spec(n) for n in ('model', 'export', 'runtime', 'tools'))"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=tmp_path, timeout=60)
