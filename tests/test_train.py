@@ -83,10 +83,9 @@ def test_entropy_by_hand() -> None:
     """Three candidates 0, 1, 2, of which the truth 1.25 shares itself between the last two."""
     probability = torch.tensor([0.2, 0.5, 0.3]).reshape(1, 3, 1, 1)
     candidates = torch.tensor([0.0, 1.0, 2.0]).reshape(1, 3, 1, 1)
-    unit = SimpleNamespace(probability=probability, candidates=candidates)
-    found = losses.entropy_loss(unit, torch.full((1, 1, 1, 1), 1.25))
+    found = losses.entropy_loss(probability, candidates, torch.full((1, 1, 1, 1), 1.25))
     assert float(found) == pytest.approx(-0.75 * math.log(0.5) - 0.25 * math.log(0.3))
-    assert losses.entropy_loss(unit, torch.full((1, 1, 1, 1), 2.5)) == 0  # outside of the candidates
+    assert losses.entropy_loss(probability, candidates, torch.full((1, 1, 1, 1), 2.5)) == 0  # outside of the candidates
 
 
 def test_monocular_loss_knows_no_scale() -> None:

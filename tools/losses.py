@@ -11,12 +11,14 @@ from torch import Tensor
 from ..model.config import IDESplatConfig
 from ..model.dpbu import Boosted
 from ..model.encoder import Encoded
+from ..model.layers import repeat_views
 
 # Shares of the terms of one stage's loss.
 FIRST_LAYER_SHARE = 0.5
 RELATIVE_SHARE = 3.0
 GRADIENT_SHARE = 0.5
 ENTROPY_SHARE = 0.3
+MATCHING_SHARE = 0.5
 MONOCULAR_SHARE = 0.3
 # From here on errors count logarithmically, so that hidden and textureless pixels do not rule: relative to the truth's
 # inverse depth, and in candidates of the coarsest unit.
@@ -66,29 +68,40 @@ def softened(error: Tensor, large: float) -> Tensor:
     return large * torch.log1p(error / large)
 
 
-def entropy_loss(unit: Boosted, truth: Tensor) -> Tensor:
+def entropy_loss(probability: Tensor, candidates: Tensor, truth: Tensor) -> Tensor:
     """Cross entropy with the two candidates next to the truth, shared by distance; pixels outside the candidates: none.
 
-    truth: inverse depth [views, 1, h, w].
+    probability, candidates: [n, candidates, h, w], candidates in inverse depth; truth: inverse depth [n, 1, h, w].
     """
-    low = unit.candidates[:, :1]
-    step = unit.candidates[:, 1:2] - low
-    last = unit.candidates.shape[1] - 1
+    low = candidates[:, :1]
+    step = candidates[:, 1:2] - low
+    last = candidates.shape[1] - 1
     position = (truth - low) / step.clamp(min=TINY)
     inside = (position >= 0) & (position <= last)
     below = position.floor().clamp(0, last - 1)
     upper = (position - below).clamp(0, 1)
     index = below.long()
-    log = unit.probability.clamp(min=TINY).log()
+    log = probability.clamp(min=TINY).log()
     entropy = -(1 - upper) * log.gather(1, index) - upper * log.gather(1, index + 1)
     return (entropy * inside).sum() / inside.sum().clamp(min=1)
 
 
-def unit_loss(unit: Boosted, inverse_depth: Tensor, bins: Tensor) -> Tensor:
-    """Everything that one boosting unit is asked; inverse_depth: the truth, [views, H, W]."""
+def unit_loss(unit: Boosted, scores: tuple[Tensor, Tensor], inverse_depth: Tensor, bins: Tensor) -> Tensor:
+    """Everything that one boosting unit is asked.
+
+    scores: what its two layers found by matching alone, each [views * neighbours, candidates, h, w]. They are asked
+    for the truth themselves, since features learn to match much later where only the U-Net behind them is asked.
+    inverse_depth: the truth, [views, H, W].
+    """
     truth = truth_at(inverse_depth, *unit.inverse_depth.shape[2:])
-    loss = inverse_depth_loss(unit.inverse_depth, truth, bins) + ENTROPY_SHARE * entropy_loss(unit, truth)
-    return loss + FIRST_LAYER_SHARE * inverse_depth_loss(unit.inverse_depth_first, truth, bins)
+    loss = inverse_depth_loss(unit.inverse_depth, truth, bins)
+    loss = loss + ENTROPY_SHARE * entropy_loss(unit.probability, unit.candidates, truth)
+    loss = loss + FIRST_LAYER_SHARE * inverse_depth_loss(unit.inverse_depth_first, truth, bins)
+    neighbours = scores[0].shape[0] // truth.shape[0]
+    candidates, truth = repeat_views(unit.candidates, neighbours), repeat_views(truth, neighbours)
+    for layer in scores:
+        loss = loss + MATCHING_SHARE * entropy_loss(layer.softmax(1), candidates, truth)
+    return loss
 
 
 def monocular_loss(encoded: Encoded, inverse_depth: Tensor) -> Tensor:

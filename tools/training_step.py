@@ -1,9 +1,11 @@
 """One scene through the parts of the network that a phase trains: predictions, losses and measures."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ..model.dpbu import Boosted, Cameras
 from ..model.encoder import Encoded
@@ -64,17 +66,37 @@ def render_targets(gaussians: tuple[Tensor, ...], views: Views) -> Tensor:
     return torch.stack(images).permute(0, 3, 1, 2)
 
 
+@contextmanager
+def matching_scores(model: IDESplat) -> Iterator[list[Tensor]]:
+    """Collect what each epipolar layer hands to its regulariser, two layers a unit, [pairs, candidates, h, w] each."""
+    scores: list[Tensor] = []
+
+    def collect(_: nn.Module, inputs: tuple[Tensor, int]) -> None:
+        scores.append(inputs[0][:, 1:])  # the first channel is the seed
+
+    layers = [layer for unit in (model.dpbu1, model.dpbu2, model.dpbu3) for layer in (unit.first, unit.second)]
+    handles = [layer.regulariser.register_forward_pre_hook(collect) for layer in layers]
+    try:
+        yield scores
+    finally:
+        for handle in handles:
+            handle.remove()
+
+
 def scene_loss(
     model: IDESplat, views: Views, phase: Phase, objective: Objective, perceptual: Perceptual | None
 ) -> tuple[Tensor, dict[str, float]]:
     """The loss of a scene, and what is logged of it."""
-    outcome = run_phase(model, views, phase)
+    with matching_scores(model) as scores:
+        outcome = run_phase(model, views, phase)
     loss = torch.zeros(())
     entry = measures(outcome, views)
     if objective is not Objective.PHOTOMETRIC:
         bins = coarse_bin(model.config, views.near, views.far)
         loss = loss + monocular_loss(outcome.encoded, views.inverse_depth)
-        loss = loss + sum(unit_loss(unit, views.inverse_depth, bins) for unit in outcome.units)
+        for index, unit in enumerate(outcome.units):
+            of_layers = scores[2 * index], scores[2 * index + 1]
+            loss = loss + unit_loss(unit, of_layers, views.inverse_depth, bins)
         if phase.units == 3:
             loss = loss + inverse_depth_loss(outcome.inverse_depth, views.inverse_depth[:, None], bins)
     if outcome.rendered is not None:
