@@ -105,8 +105,8 @@ BAD = {
         (),
         "transform_matrix",
     ),
-    "zero focal length": (change_cameras(lambda c: c.update(fl_x=0)), (), "fl_x"),
-    "negative focal length": (change_cameras(lambda c: c.update(fl_y=-300)), (), "fl_y"),
+    "zero focal length": (change_cameras(lambda c: c.update(fl_x=0)), (), "focal lengths are 0"),
+    "negative focal length": (change_cameras(lambda c: c.update(fl_y=-300)), (), "focal lengths"),
     "one photograph": (lambda: [path.unlink() for path in sorted(Path("images").iterdir())[1:]], (), "at least 2"),
     "two identical cameras": (
         change_cameras(
@@ -126,6 +126,7 @@ BAD = {
     "an unknown provider": (nothing, ("--provider", "Abacus"), "Abacus"),
     "a provider that is not installed": (nothing, ("--provider", "CUDA"), "CUDA"),
     "an output folder that is not there": (nothing, ("--out", "nowhere/scene.ply"), "nowhere"),
+    "an output folder that nobody may write to": (nothing, ("--out", "/proc/scene.ply"), "cannot write into /proc"),
     "an output that is no splat file": (nothing, ("--out", "scene.txt"), ".ply"),
     "an output folder that is a file": (nothing, ("--save-depth", "transforms.json"), "transforms.json"),
 }
@@ -143,12 +144,3 @@ def test_bad_input_is_one_line_and_leaves_nothing(workplace, capfd, name):
     assert len(lines) == 1
     assert expected in lines[0]
     assert {path: path.stat().st_mtime_ns for path in workplace.rglob("*")} == before
-
-
-@pytest.mark.skipif(
-    not hasattr(__import__("os"), "geteuid") or __import__("os").geteuid() == 0, reason="root may write anywhere"
-)
-def test_an_unwritable_folder_is_refused(workplace, capsys):
-    Path("locked").mkdir(mode=0o500)
-    assert run_command(main, *USUAL[:-1], "locked/scene.ply") == 2
-    assert "cannot write into locked" in capsys.readouterr().err
