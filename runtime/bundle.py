@@ -60,9 +60,8 @@ class StageFile:
 def read_description(properties: dict[str, str], path: Path) -> Description:
     """The description in a model's metadata properties; raises InputError if the model is not ours."""
     if METADATA_KEY not in properties:
-        raise InputError(
-            f"{path}: not a model of this project (no '{METADATA_KEY}' metadata); make one with idesplat-export"
-        )
+        lack = f"not a model of this project (no '{METADATA_KEY}' metadata)"
+        raise InputError(f"{path}: {lack}; make one with idesplat-export")
     try:
         content = json.loads(properties[METADATA_KEY])
         if content.get("layout") != LAYOUT:

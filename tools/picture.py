@@ -44,7 +44,7 @@ def picture(
     middle = interpolate_extrinsics(np.stack([camera.extrinsics for camera in cameras]), 3)[1]
     between = draw_view(gaussians, middle, cameras[0].K, cameras[0].width, cameras[0].height).rgb
     save_depth_png(out, depths[0])
-    depth = cv2.imread(str(out))[..., ::-1]
+    depth = load_image(out)
     strip = [photographs[0] / 255, depth / 255, between, photographs[1] / 255]
     save_png(out, cv2.resize(np.hstack(strip).astype(np.float32), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
     print(f"wrote {out}")
