@@ -65,9 +65,8 @@ def read_description(properties: dict[str, str], path: Path) -> Description:
     try:
         content = json.loads(properties[METADATA_KEY])
         if content.get("layout") != LAYOUT:
-            raise InputError(
-                f"{path}: metadata layout {content.get('layout')!r}, expected {LAYOUT}; export it again with this version"
-            )
+            found = f"metadata layout {content.get('layout')!r}, expected {LAYOUT}"
+            raise InputError(f"{path}: {found}; export it again with this version")
         return _from_dict(Description, content)
     except (ValueError, TypeError, AttributeError) as error:
         if isinstance(error, InputError):
