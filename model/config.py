@@ -178,7 +178,7 @@ PRESETS: dict[str, IDESplatConfig | DepthSplatConfig] = {
     "idesplat-re10k": IDESplatConfig(),
     "idesplat-acid": IDESplatConfig(),
     "idesplat-dl3dv": IDESplatConfig(feature_stride=8, far=200.0, height=256, width=448),
-    # Every part in small, for CPUs: 3.5 million parameters, trained from scratch, the ViT along.
+    # Every part in small, for CPUs: 3.0 million parameters, trained from scratch, the ViT along.
     "idesplat-tiny": IDESplatConfig(
         backbone_channels=(24, 32, 48),
         feature_channels=48,
@@ -189,7 +189,7 @@ PRESETS: dict[str, IDESplatConfig | DepthSplatConfig] = {
         vit=ViTConfig(dim=96, depth=4, heads=3, grid=18, taps=(0, 1, 2, 3)),
         dpt=DPTConfig(features=32, channels=(24, 48, 96, 96), disparity_channels=16),
         dpbus=(
-            DPBUConfig(channels=64, candidates=97, scale=1, unet=UNetConfig(channels=48, levels=3)),
+            DPBUConfig(channels=64, candidates=97, scale=1, unet=UNetConfig(channels=40, levels=3)),
             DPBUConfig(channels=32, candidates=25, scale=2, unet=UNetConfig(channels=16, levels=4)),
             DPBUConfig(channels=8, candidates=9, scale=4, unet=UNetConfig(channels=8, levels=5)),
         ),
