@@ -5,6 +5,7 @@ import shutil
 import sys
 import tempfile
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -43,6 +44,8 @@ def export(
     Views, height and width stay dynamic unless fixed by --views and --size.
     """
     _check_targets(out, staged)
+    if find_spec("torch") is None or find_spec("onnx") is None:
+        raise InputError("exporting needs PyTorch and onnx, which are not installed; pip install 'idesplat[export]'")
     from ..model.checkpoint import CheckpointError
     from .exporter import Fixed
 

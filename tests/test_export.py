@@ -173,3 +173,9 @@ def test_metadata_of_another_layout_is_refused(tmp_path):
     content = json.dumps({"layout": 99})
     with pytest.raises(ValueError, match="layout 99, expected 1"):
         read_description({"idesplat": content}, tmp_path)
+
+
+def test_without_pytorch_the_remedy_is_named(small_checkpoint, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(cli, "find_spec", lambda name: None)
+    assert run_command(cli.main, small_checkpoint, tmp_path / "out.onnx") == 2
+    assert "pip install 'idesplat[export]'" in capsys.readouterr().err
