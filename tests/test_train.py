@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
@@ -55,8 +56,13 @@ SETTINGS = Settings("small", "both", True, steps=8, batch=2, size=64, lr=1e-3, v
 
 
 @pytest.fixture(autouse=True)
-def one_thread() -> None:
+def one_thread() -> Iterator[None]:
+    """One torch thread, as in training, and afterwards the arithmetic that other tests expect."""
+    threads = torch.get_num_threads()
     torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+    torch.set_flush_denormal(False)
 
 
 def test_tiny_preset_is_small_and_complete() -> None:
