@@ -4,8 +4,8 @@ Whether a projection lands on one pixel or its neighbour is decided by rounding,
 moves everything behind it: the released program itself, run on another processor, has 83 % of its depths within 1e-3 of
 these references, and pictures moved by one unit in the last place give 98 % of our own (docs/parity.md). So each stage
 starts here from the reference's inverse depth (which the cases hold in full), and what is left is the rounding within
-one stage. The bounds of the units and Gaussians are what that rounding needs; a wrong constant or order departs by whole
-deviations.
+one stage. The bounds of the units and Gaussians are what that rounding needs; a wrong constant or order departs by
+whole deviations.
 """
 
 from pathlib import Path
