@@ -14,6 +14,7 @@ import typer
 from ..runtime.bundle import MANIFEST_NAME, Description, StageFile, write_manifest
 from ..runtime.errors import InputError, exit_on_input_error
 from ..runtime.files import check_writable, make_folder, replacing
+from ..runtime.sizes import parse_size, size_fits, size_rule
 
 if TYPE_CHECKING:
     import onnx
@@ -53,7 +54,7 @@ def export(
         model, name = _load(checkpoint, preset)
     except CheckpointError as error:
         raise InputError(str(error)) from None
-    fixed = Fixed(views, _parse_size(size, model.config.size_multiple) if size else None)
+    fixed = Fixed(views, _fitting_size(size, model.config.size_multiple) if size else None)
     description = _describe(model, name, checkpoint, fixed)
     if not _export(model, description, fixed, out, staged):
         print("error: the graph departs from the network (see the table); nothing was written", file=sys.stderr)
@@ -81,14 +82,11 @@ def _check_targets(out: Path | None, staged: Path | None) -> None:
         check_writable(make_folder(staged.parent))
 
 
-def _parse_size(text: str, multiple: int) -> tuple[int, int]:
+def _fitting_size(text: str, multiple: int) -> tuple[int, int]:
     """`HEIGHTxWIDTH`, multiples of what the network needs."""
-    parts = text.lower().split("x")
-    if len(parts) != 2 or not all(part.isdigit() for part in parts):
-        raise InputError(f"--size {text}: expected HEIGHTxWIDTH, such as 256x256")
-    height, width = int(parts[0]), int(parts[1])
-    if height % multiple or width % multiple or min(height, width) < 2 * multiple:
-        raise InputError(f"--size {text}: height and width must be multiples of {multiple} from {2 * multiple}")
+    height, width = parse_size(text)
+    if not size_fits(height, width, multiple):
+        raise InputError(f"--size {text}: {size_rule(multiple)}")
     return height, width
 
 

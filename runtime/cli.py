@@ -12,6 +12,7 @@ import typer
 
 from .errors import InputError, exit_on_input_error
 from .files import check_writable, make_folder, replacing
+from .sizes import parse_size
 
 if TYPE_CHECKING:
     import numpy as np
@@ -105,17 +106,10 @@ def _load(
 
     pairs = match(find_images(given), read_cameras(camera_file))
     runner = Runner(model, provider)
-    height, width = _parse_size(size) if size else runner.size_for([camera for _, camera in pairs])
+    height, width = parse_size(size) if size else runner.size_for([camera for _, camera in pairs])
     count = min(runner.description.fixed_views or views, len(pairs))
     runner.check_size(max(count, DEFAULT_VIEWS), height, width)
     return prepare(pairs, count if len(pairs) > count else None, height, width), runner, len(pairs)
-
-
-def _parse_size(text: str) -> tuple[int, int]:
-    parts = text.lower().split("x")
-    if len(parts) != 2 or not all(part.isdigit() for part in parts):
-        raise InputError(f"--size {text}: expected HEIGHTxWIDTH, such as 256x256")
-    return int(parts[0]), int(parts[1])
 
 
 def _predict(views: "Views", runner: "Runner", near: float | None, far: float | None) -> "Prediction":

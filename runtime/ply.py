@@ -57,23 +57,20 @@ def write_ply(path: Path, gaussians: Gaussians) -> None:
     names[3:3] = ["nx", "ny", "nz"]  # gaussforge and some older viewers insist on normals
     properties = "".join(f"property float {name}\n" for name in names)
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(gaussians)}\n{properties}end_header\n"
-    try:
-        with replacing(path) as temporary, temporary.open("wb") as file:
-            table = np.zeros((VERTICES_AT_ONCE, len(names)), "<f4")
-            _reserve(file, len(header) + len(gaussians) * table.itemsize * len(names))
-            file.write(header.encode("ascii"))
-            for block in _blocks(len(gaussians)):
-                rows = table[: block.stop - block.start]
-                _encode(gaussians, block, rows)
-                if not np.isfinite(rows).all():
-                    vertex, column = np.argwhere(~np.isfinite(rows))[0]
-                    raise InputError(
-                        f"cannot write {path}: {names[column]} of Gaussian {block.start + vertex} is not finite; "
-                        "leave that Gaussian out"
-                    )
-                file.write(rows.data)
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror}; choose a file on a disk with room for it") from None
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        table = np.zeros((VERTICES_AT_ONCE, len(names)), "<f4")
+        _reserve(file, len(header) + len(gaussians) * table.itemsize * len(names))
+        file.write(header.encode("ascii"))
+        for block in _blocks(len(gaussians)):
+            rows = table[: block.stop - block.start]
+            _encode(gaussians, block, rows)
+            if not np.isfinite(rows).all():
+                vertex, column = np.argwhere(~np.isfinite(rows))[0]
+                raise InputError(
+                    f"cannot write {path}: {names[column]} of Gaussian {block.start + vertex} is not finite; "
+                    "leave that Gaussian out"
+                )
+            file.write(rows.data)
 
 
 def read_ply(path: Path) -> Gaussians:

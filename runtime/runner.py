@@ -12,6 +12,7 @@ from .cameras import Camera
 from .errors import InputError
 from .gaussians import Gaussians
 from .session import CPU, open_session, provider_name, run_session
+from .sizes import size_fits, size_rule
 from .views import check_views, prepare
 
 FUSED = "model"
@@ -106,7 +107,7 @@ class Runner:
 
     def check_size(self, views: int, height: int, width: int) -> None:
         """Raise InputError unless the model takes this many views of this size."""
-        own, multiple = self.description, self.description.size_multiple
+        own = self.description
         if own.fixed_views and views != own.fixed_views:
             raise InputError(
                 f"{self.path}: was exported for {own.fixed_views} views and got {views}; use --views {own.fixed_views}"
@@ -116,12 +117,9 @@ class Runner:
                 f"{self.path}: was exported for {own.height}x{own.width} and got {height}x{width}; "
                 f"use --size {own.height}x{own.width}, or export without --size"
             )
-        smallest = 2 * multiple
-        if height % multiple or width % multiple or min(height, width) < smallest:
-            raise InputError(
-                f"{self.path}: cannot take images of {height}x{width}; "
-                f"height and width must be multiples of {multiple} from {smallest}"
-            )
+        if not size_fits(height, width, own.size_multiple):
+            rule = size_rule(own.size_multiple)
+            raise InputError(f"{self.path}: cannot take images of {height}x{width}; {rule}")
 
     def _run(self, values: dict[str, np.ndarray]) -> Prediction:
         seconds = {}
