@@ -7,13 +7,19 @@ print it without a traceback and exit with `EXIT_STATUS`; library users catch `I
 import functools
 import sys
 from collections.abc import Callable
-from typing import Any
+from pathlib import Path
+from typing import Any, NoReturn
 
 EXIT_STATUS = 2
 
 
 class InputError(ValueError):
     """Something the user gave cannot be used: a file, a camera, an option."""
+
+
+def refuse(path: Path, what: str, remedy: str) -> NoReturn:
+    """Raise InputError for a file: what is wrong with it, and what was expected or to do."""
+    raise InputError(f"{path}: {what}; {remedy}")
 
 
 def exit_on_input_error(command: Callable[..., Any]) -> Callable[..., Any]:

@@ -9,38 +9,18 @@ import os
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import BinaryIO, NamedTuple, NoReturn
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
-from .errors import InputError
+from .errors import InputError, refuse
 from .files import replacing
 from .gaussians import Gaussians
+from .ply_header import LIST, Element, read_header
 
 VERTICES_AT_ONCE = 1 << 13  # their rows stay in the cache while columns are filled one by one
 MIN_OPACITY = 1e-6  # a logit must be finite: opacities are kept this far from 0 and 1
 MIN_SCALE = 1e-30  # so must a logarithm
-MAX_HEADER_BYTES = 1 << 20
-MAGIC = b"ply"
-NUMBER_TYPES = {
-    "char": "<i1",
-    "int8": "<i1",
-    "uchar": "<u1",
-    "uint8": "<u1",
-    "short": "<i2",
-    "int16": "<i2",
-    "ushort": "<u2",
-    "uint16": "<u2",
-    "int": "<i4",
-    "int32": "<i4",
-    "uint": "<u4",
-    "uint32": "<u4",
-    "float": "<f4",
-    "float32": "<f4",
-    "double": "<f8",
-    "float64": "<f8",
-}
-LIST = "list"  # the type of a property whose length differs from row to row
 
 
 def write_ply(path: Path, gaussians: Gaussians) -> None:
@@ -129,14 +109,6 @@ def _encode(gaussians: Gaussians, block: slice, rows: np.ndarray) -> None:
     rows[:, -4:] = gaussians.quats[block]
 
 
-class _Element(NamedTuple):
-    """One element of a .ply header."""
-
-    name: str
-    length: int
-    properties: dict[str, str]  # name -> NumPy type, or LIST
-
-
 class _Vertices(NamedTuple):
     """Where the vertices lie in a file and what a row of them holds."""
 
@@ -184,22 +156,22 @@ def _check_finite(gaussians: Gaussians, block: slice, path: Path) -> None:
 def _find_vertices(file: BinaryIO, path: Path) -> _Vertices:
     """Check header and size of a file against what a splat file must have."""
     offset = 0
-    elements, header_bytes = _read_header(file, path)
+    elements, header_bytes = read_header(file, path)
     for element in elements:
         if element.name == "vertex":
             break
         if LIST in element.properties.values():
-            _refuse(path, f"element {element.name} with lists stands before the vertices", "write the vertices first")
-        offset += element.length * np.dtype(list(element.properties.items())).itemsize
+            refuse(path, f"element {element.name} with lists stands before the vertices", "write the vertices first")
+        offset += element.length * element.row.itemsize
     else:
-        _refuse(path, "the header has no element vertex", "give a 3D Gaussian splatting .ply")
+        refuse(path, "the header has no element vertex", "give a 3D Gaussian splatting .ply")
 
     sh_coefficients = _checked_properties(element, path)
-    row = np.dtype(list(element.properties.items()))
+    row = element.row
     offset += header_bytes
     expected, size = offset + element.length * row.itemsize, os.fstat(file.fileno()).st_size
     if size < expected:
-        _refuse(
+        refuse(
             path,
             f"cut short: {element.length} vertices need {expected} bytes, the file has {size}",
             "copy or download it again",
@@ -207,12 +179,12 @@ def _find_vertices(file: BinaryIO, path: Path) -> _Vertices:
     return _Vertices(offset, element.length, row, sh_coefficients)
 
 
-def _checked_properties(vertex: _Element, path: Path) -> int:
+def _checked_properties(vertex: Element, path: Path) -> int:
     """SH coefficients a channel of an element that has all that a Gaussian needs, as floating-point numbers."""
     rest = sum(name.startswith("f_rest_") for name in vertex.properties)
     coefficients = 1 + rest // 3
     if rest not in (0, 9, 24, 45):
-        _refuse(
+        refuse(
             path,
             f"{rest} properties f_rest_*",
             "expected 0, 9, 24 or 45 (SH degree 0 to 3); write it with one of those",
@@ -221,54 +193,14 @@ def _checked_properties(vertex: _Element, path: Path) -> int:
     needed = _columns(Gaussians(sample[:, 0], sample[:, 0], np.empty((0, 4)), np.empty(0), sample))
     missing = [name for name in needed if name not in vertex.properties]
     if missing:
-        _refuse(
+        refuse(
             path,
             f"element vertex has no property {', '.join(missing)}",
             "give a 3D Gaussian splatting .ply, not a mesh, plain points or a compressed splat",
         )
     for name in needed:
         if vertex.properties[name] not in ("<f4", "<f8"):
-            _refuse(path, f"property {name} is not float or double", "write it as float")
+            refuse(path, f"property {name} is not float or double", "write it as float")
     if LIST in vertex.properties.values():
-        _refuse(path, "element vertex has a list property", "write the file without it")
+        refuse(path, "element vertex has a list property", "write the file without it")
     return coefficients
-
-
-def _read_header(file: BinaryIO, path: Path) -> tuple[list[_Element], int]:
-    """The elements that a .ply header announces, and the header's length in bytes."""
-    if file.readline(8).rstrip() != MAGIC:
-        _refuse(path, "not a .ply file (it does not begin with the line 'ply')", "give a 3D Gaussian splatting .ply")
-    elements: list[_Element] = []
-    has_format = False
-    while file.tell() < MAX_HEADER_BYTES:
-        line = file.readline(MAX_HEADER_BYTES)
-        if not line.endswith(b"\n"):
-            break
-        match line.decode("ascii", errors="replace").split():
-            case ["format", "binary_little_endian", "1.0"]:
-                has_format = True
-            case ["format", *form]:
-                _refuse(path, f"format {' '.join(form)}", "expected binary_little_endian 1.0; convert the file to that")
-            case ["element", name, count] if count.isascii() and count.isdigit() and len(count) < 19:
-                elements.append(_Element(name, int(count), {}))
-            case ["property", kind, name] if elements and kind in NUMBER_TYPES:
-                _add_property(elements[-1], name, NUMBER_TYPES[kind], path)
-            case ["property", "list", _, _, name] if elements:
-                _add_property(elements[-1], name, LIST, path)
-            case ["end_header"] if has_format:
-                return elements, file.tell()
-            case ["comment" | "obj_info", *_] | []:
-                pass
-            case words:
-                _refuse(path, f"header line '{' '.join(words)[:60]}' means nothing here", "write the file again")
-    _refuse(path, "the header has no end", "copy or download it again")
-
-
-def _add_property(element: _Element, name: str, number_type: str, path: Path) -> None:
-    if name in element.properties:
-        _refuse(path, f"element {element.name} has property {name} twice", "write it once")
-    element.properties[name] = number_type
-
-
-def _refuse(path: Path, what: str, remedy: str) -> NoReturn:
-    raise InputError(f"{path}: {what}; {remedy}")

@@ -1,0 +1,82 @@
+"""What a .ply file announces about itself, for every layout that is written into one."""
+
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import numpy as np
+
+from .errors import refuse
+
+MAX_HEADER_BYTES = 1 << 20
+MAGIC = b"ply"
+NUMBER_TYPES = {
+    "char": "<i1",
+    "int8": "<i1",
+    "uchar": "<u1",
+    "uint8": "<u1",
+    "short": "<i2",
+    "int16": "<i2",
+    "ushort": "<u2",
+    "uint16": "<u2",
+    "int": "<i4",
+    "int32": "<i4",
+    "uint": "<u4",
+    "uint32": "<u4",
+    "float": "<f4",
+    "float32": "<f4",
+    "double": "<f8",
+    "float64": "<f8",
+}
+LIST = "list"  # the type of a property whose length differs from row to row
+
+
+class Element(NamedTuple):
+    """One element of a .ply header."""
+
+    name: str
+    length: int
+    properties: dict[str, str]  # name -> NumPy type, or LIST
+
+    @property
+    def row(self) -> np.dtype:
+        """The type of a row of an element without lists."""
+        return np.dtype(list(self.properties.items()))
+
+
+def read_header(file: BinaryIO, path: Path) -> tuple[list[Element], int]:
+    """The elements that a binary little endian .ply header announces, and the header's length in bytes.
+
+    Raises InputError, naming the path, if the file does not begin with such a header.
+    """
+    if file.readline(8).rstrip() != MAGIC:
+        refuse(path, "not a .ply file (it does not begin with the line 'ply')", "give a 3D Gaussian splatting .ply")
+    elements: list[Element] = []
+    has_format = False
+    while file.tell() < MAX_HEADER_BYTES:
+        line = file.readline(MAX_HEADER_BYTES)
+        if not line.endswith(b"\n"):
+            break
+        match line.decode("ascii", errors="replace").split():
+            case ["format", "binary_little_endian", "1.0"]:
+                has_format = True
+            case ["format", *form]:
+                refuse(path, f"format {' '.join(form)}", "expected binary_little_endian 1.0; convert the file to that")
+            case ["element", name, count] if count.isascii() and count.isdigit() and len(count) < 19:
+                elements.append(Element(name, int(count), {}))
+            case ["property", kind, name] if elements and kind in NUMBER_TYPES:
+                _add_property(elements[-1], name, NUMBER_TYPES[kind], path)
+            case ["property", "list", _, _, name] if elements:
+                _add_property(elements[-1], name, LIST, path)
+            case ["end_header"] if has_format:
+                return elements, file.tell()
+            case ["comment" | "obj_info", *_] | []:
+                pass
+            case words:
+                refuse(path, f"header line '{' '.join(words)[:60]}' means nothing here", "write the file again")
+    refuse(path, "the header has no end", "copy or download it again")
+
+
+def _add_property(element: Element, name: str, number_type: str, path: Path) -> None:
+    if name in element.properties:
+        refuse(path, f"element {element.name} has property {name} twice", "write it once")
+    element.properties[name] = number_type
