@@ -24,6 +24,8 @@ class EpipolarAttention(nn.Module):
         super().__init__()
         channels, candidates = config.channels, config.candidates
         self.scale = channels**-0.5
+        # The two sparse products; training on a CPU puts compiled ones in their place.
+        self.correlate, self.weigh = correlate, weigh
         # Position embeddings of the candidates, for keys, values and scores.
         self.key_position = nn.Parameter(torch.zeros(candidates))
         self.value_position = nn.Parameter(torch.zeros(candidates))
@@ -52,7 +54,7 @@ class EpipolarAttention(nn.Module):
         tokens = to_tokens(features)
         normed = self.norm1(tokens)
         queries = repeat_views(self.q_proj(normed) * self.scale, neighbours)
-        scores = correlate(queries, pixel_table(self.k_proj(normed)), rows)  # [pairs, candidates, h * w]
+        scores = self.correlate(queries, pixel_table(self.k_proj(normed)), rows)  # [pairs, candidates, h * w]
         scores = scores + queries.sum(-1)[:, None] * self.key_position[:, None] + self.score_position[:, None]
 
         known = torch.cat(
@@ -63,7 +65,7 @@ class EpipolarAttention(nn.Module):
             product = probability * prior
             probability = (product + EPSILON) / (product.sum(1, keepdim=True) + EPSILON)
 
-        gathered = weigh(probability, pixel_table(self.v_proj(normed)), rows)  # [pairs, h * w, channels]
+        gathered = self.weigh(probability, pixel_table(self.v_proj(normed)), rows)  # [pairs, h * w, channels]
         gathered = gathered + (probability * self.value_position[:, None]).sum(1)[..., None]
         tokens = tokens + self.proj(gathered.reshape(views, neighbours, -1, fixed(gathered.shape[2])).mean(1))
         tokens = tokens + self.ffn(self.norm2(tokens), height, width)

@@ -11,8 +11,6 @@ from idesplat.tools.scenes import (
     HELD_OUT_SEEDS,
     TRAINING_SEEDS,
     VALIDATION_SEEDS,
-    WIDE_FAR,
-    WIDE_NEAR,
     Sample,
     draw_sample,
     look_at,
@@ -125,10 +123,10 @@ def test_samples_are_well_formed() -> None:
         rotations = sample.extrinsics[:, :3, :3].astype(np.float64)
         np.testing.assert_allclose(rotations @ rotations.transpose(0, 2, 1), np.eye(3)[None].repeat(4, 0), atol=1e-6)
         np.testing.assert_allclose(np.linalg.det(rotations), 1, atol=1e-6)
-    wide = [sample.near == WIDE_NEAR and sample.far == WIDE_FAR for sample in samples]
-    assert 0.4 < np.mean(wide) < 0.8
-    medians = [np.median(sample.depth) for sample in samples]
-    assert np.quantile(medians, 0.05) > 1 and np.quantile(medians, 0.95) < 15
+        assert sample.near == 1
+    # A tight range is at most four times (1 / 0.5 times 2) as wide as the scene.
+    wide = [sample.far > 4 * sample.depth.max() / sample.depth.min() for sample in samples]
+    assert 0.1 < np.mean(wide) < 0.4
     baselines = [
         np.linalg.norm(sample.extrinsics[1, :3, 3] - sample.extrinsics[0, :3, 3]) / np.median(sample.depth[0])
         for sample in samples

@@ -94,6 +94,16 @@ def test_entropy_by_hand() -> None:
     assert losses.entropy_loss(probability, candidates, torch.full((1, 1, 1, 1), 2.5)) == 0  # outside of the candidates
 
 
+def test_splats_of_the_wanted_size_cost_nothing() -> None:
+    depth = torch.tensor([[[1.0, 2.0], [4.0, 8.0]]])
+    intrinsics = torch.tensor([[[0.5, 0, 0.5], [0, 0.5, 0.5], [0, 0, 1]]])
+    # With a focal length of half the width of two pixels, a pixel is as large as its depth.
+    wanted = losses.SPLAT_PIXELS * depth.reshape(-1, 1).expand(-1, 3)
+    assert float(losses.splat_size_loss(wanted, depth, intrinsics)) == pytest.approx(0, abs=1e-7)
+    found = losses.splat_size_loss(wanted * math.e, depth, intrinsics)
+    assert float(found) == pytest.approx(losses.SPLAT_SHARE, rel=1e-5)
+
+
 def test_monocular_loss_knows_no_scale() -> None:
     truth = torch.rand(2, 8, 8) + 0.1
     scaled = SimpleNamespace(mono_disparity=0.37 * truth[:, None])
@@ -151,9 +161,9 @@ def test_curriculum_and_rates() -> None:
 
 
 def test_scenes_come_in_order_and_repeat() -> None:
-    orders = [training_order(5, step, 0, 1, 32, 32, many=True) for step in range(40)]
-    assert orders == [training_order(5, step, 0, 1, 32, 32, many=True) for step in range(40)]
-    assert len({order.seed for order in orders}) == 40 and {order.context for order in orders} == {2, 3}
+    orders = [training_order(5, step, 0, 1, 32, 32, many=True) for step in range(120)]
+    assert orders == [training_order(5, step, 0, 1, 32, 32, many=True) for step in range(120)]
+    assert len({order.seed for order in orders}) == 120 and {order.context for order in orders} == {2, 3}
     drawn = list(drawn_ahead(iter(orders[:7])))
     for order, views in zip(orders, drawn, strict=False):
         assert views.images.shape == (order.context, 3, 32, 32)

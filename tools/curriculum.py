@@ -31,11 +31,11 @@ class Phase:
 
 
 GRADUAL = (
-    Phase(0.55, units=1, gaussians=False, shrink=2),
-    Phase(0.70, units=2, gaussians=False, shrink=2),
-    Phase(0.80, units=3, gaussians=False, shrink=2),
-    Phase(0.96, units=3, gaussians=True, shrink=2),
-    Phase(1.00, units=3, gaussians=True, shrink=1),
+    Phase(0.620, units=1, gaussians=False, shrink=2),
+    Phase(0.770, units=2, gaussians=False, shrink=2),
+    Phase(0.870, units=3, gaussians=False, shrink=2),
+    Phase(0.985, units=3, gaussians=True, shrink=2),
+    Phase(1.000, units=3, gaussians=True, shrink=1),
 )
 
 

@@ -18,6 +18,8 @@ from ..model.unet import CostRegulariser, ResBlock
 TEMPERATURE = 2.0
 # What remains of random weights beside the anchored ones.
 NOISE = 0.2
+# The opacity's logit, so that surfaces hide what is behind them from the start.
+OPAQUE = 2.0
 # How much each of the multi-view transformer's messages first adds to the features that are matched.
 MESSAGE = 0.1
 
@@ -34,6 +36,10 @@ def new_model(config: IDESplatConfig, seed: int) -> IDESplat:
         elif isinstance(part, TransformerBlock | WindowAttention):
             nn.init.constant_(part.norm.weight, MESSAGE)
     _anchor(model.gaussians.residual, first=config.dpbus[2].channels)
+    opacity_and_more = model.gaussians.head2.bias
+    assert opacity_and_more is not None
+    with torch.no_grad():
+        opacity_and_more[0] = OPAQUE
     # The monocular disparity is one over this layer's output: it must start away from zero.
     bias = model.encoder.dpt.disparity3.bias
     assert bias is not None

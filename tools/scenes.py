@@ -15,8 +15,8 @@ TRAINING_SEEDS = range(0, 1_000_000_000)
 VALIDATION_SEEDS = range(1_000_000_000, 1_000_000_100)
 HELD_OUT_SEEDS = range(1_000_001_000, 1_000_001_200)
 
-WIDE_NEAR, WIDE_FAR = 0.5, 100.0  # the depth range that photographs without a better one are given
-WIDE_SHARE = 0.6  # of the samples have that range, the others a tight one
+WIDE_SHARE = 0.25  # of the samples have a depth range far wider than they fill, up to this ratio of far to near
+WIDEST = 200.0
 PROBE = 24  # pixels: the small depth map by which a camera is judged
 ATTEMPTS = 60  # to place the cameras of a sample
 GOOD_OVERLAP = 0.6  # share of the first view's points that each other view should see
@@ -203,14 +203,13 @@ def _overlap(scene: Scene, poses: np.ndarray, intrinsics: np.ndarray, seen: np.n
 
 
 def _draw_range(rng: np.random.Generator, depth: np.ndarray) -> tuple[float, float, float]:
-    """The factor that brings the scene to its final units, and near and far there."""
-    least, most = float(depth.min()), float(depth.max())
-    scale = np.exp(rng.uniform(np.log(1.5), np.log(8.0))) / float(np.median(depth))
-    if rng.random() < WIDE_SHARE and most / least < 0.9 * WIDE_FAR / WIDE_NEAR:
-        scale = min(max(scale, 1.05 * WIDE_NEAR / least), 0.95 * WIDE_FAR / most)
-        return scale, WIDE_NEAR, WIDE_FAR
-    near, far = least * rng.uniform(0.5, 0.95), most * rng.uniform(1.05, 2.0)
-    return scale, near * scale, far * scale
+    """The factor that brings the scene to its final units, in which near is 1; near and far there."""
+    near = float(depth.min()) * rng.uniform(0.5, 0.95)
+    far = float(depth.max()) * rng.uniform(1.05, 2.0)
+    if rng.random() < WIDE_SHARE:  # as where nothing is known of the scene
+        near *= rng.uniform(0.3, 1.0)
+        far = max(far, near * np.exp(rng.uniform(np.log(10.0), np.log(WIDEST))))
+    return 1 / near, 1.0, far / near
 
 
 def _develop(rng: np.random.Generator, image: np.ndarray, worn: bool) -> np.ndarray:

@@ -12,7 +12,7 @@ from torch import Tensor
 from .scenes import TRAINING_SEEDS, Sample, draw_sample
 
 # Share of the scenes with three context views instead of two.
-THREE_VIEW_SHARE = 0.1
+THREE_VIEW_SHARE = 0.06
 # Scenes drawn ahead of their use.
 AHEAD = 4
 

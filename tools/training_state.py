@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 from torch import nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from ..model.checkpoint import CheckpointError, fill, read_state_dict
 from ..model.config import IDESplatConfig
@@ -13,9 +14,10 @@ from ..model.idesplat import IDESplat
 from ..runtime.errors import InputError
 from ..runtime.files import replacing
 from .initialisation import new_model
+from .sparse_products import with_compiled_products
 
 # The running mean forgets at this rate, and faster in the beginning.
-MEAN_DECAY = 0.995
+MEAN_DECAY = 0.998
 MEAN_START = 10
 WEIGHT_DECAY = 0.01
 LARGEST_GRADIENT = 1.0
@@ -28,7 +30,7 @@ class TrainingState:
 
     def __init__(self, config: IDESplatConfig, seed: int, lr: float, vit_lr: float) -> None:
         """A new network drawn from `seed`; learning rates at their highest, the ViT's and that of the rest."""
-        self.model = new_model(config, seed)
+        self.model = with_compiled_products(new_model(config, seed))
         self.mean = {name: value.clone() for name, value in self.model.state_dict().items()}
         self.step = 0
         parameters = list(self.model.named_parameters())
@@ -36,7 +38,7 @@ class TrainingState:
             {"params": [p for name, p in parameters if not name.startswith(BACKBONE_PREFIX)], "highest": lr},
             {"params": [p for name, p in parameters if name.startswith(BACKBONE_PREFIX)], "highest": vit_lr},
         ]
-        self.optimizer = torch.optim.AdamW(groups, lr=lr, weight_decay=WEIGHT_DECAY)
+        self.optimizer = torch.optim.AdamW(groups, lr=lr, weight_decay=WEIGHT_DECAY, fused=True)
 
     def start_from(self, path: Path) -> None:
         """Take the weights of a checkpoint, released or own; raises InputError if it does not fit the network."""
@@ -59,13 +61,13 @@ class TrainingState:
         self.optimizer.zero_grad(set_to_none=True)
         self.step += 1
         decay = min(MEAN_DECAY, self.step / (self.step + MEAN_START))
-        for name, value in self.model.state_dict().items():
-            self.mean[name].lerp_(value, 1 - decay)
+        weights = self.model.state_dict()
+        get_ema_multi_avg_fn(decay)(list(self.mean.values()), [weights[name] for name in self.mean], None)
         return norm
 
     def mean_model(self) -> IDESplat:
         """The network with the running mean of the weights, which predicts better than the last weights."""
-        model = IDESplat(self.model.config).eval()
+        model = with_compiled_products(IDESplat(self.model.config).eval())
         model.load_state_dict(self.mean)
         return model
 

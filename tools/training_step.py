@@ -13,7 +13,15 @@ from ..model.geometry import invert_rigid, scale_intrinsics
 from ..model.idesplat import IDESplat
 from ..model.layers import resize
 from .curriculum import Objective, Phase
-from .losses import Perceptual, coarse_bin, inverse_depth_loss, monocular_loss, photometric_loss, unit_loss
+from .losses import (
+    Perceptual,
+    coarse_bin,
+    inverse_depth_loss,
+    monocular_loss,
+    photometric_loss,
+    splat_size_loss,
+    unit_loss,
+)
 from .torch_rasterizer import rasterize
 from .training_data import Views
 
@@ -30,8 +38,9 @@ class Outcome:
     units: tuple[Boosted, ...]
     # The best inverse depth there is, [views, 1, h, w]; h and w are the images' once three units ran.
     inverse_depth: Tensor
-    # Novel views, [targets, 3, H, W], where the phase has Gaussians.
-    rendered: Tensor | None
+    # The Gaussians' scales and novel views, [targets, 3, H, W], where the phase has them.
+    scales: Tensor | None = None
+    rendered: Tensor | None = None
 
 
 def run_phase(model: IDESplat, views: Views, phase: Phase) -> Outcome:
@@ -40,17 +49,17 @@ def run_phase(model: IDESplat, views: Views, phase: Phase) -> Outcome:
     encoded = model.encoder(views.images, views.extrinsics)
     first = model.dpbu1(encoded, cameras)
     if phase.units == 1:
-        return Outcome(encoded, (first,), first.inverse_depth, None)
+        return Outcome(encoded, (first,), first.inverse_depth)
     second = model.dpbu2(encoded, first, cameras)
     if phase.units == 2:
-        return Outcome(encoded, (first, second), second.inverse_depth, None)
+        return Outcome(encoded, (first, second), second.inverse_depth)
     units = (first, second, model.dpbu3(encoded, second, cameras))
     if not phase.gaussians:
         fused = model.gaussians.fused_inverse_depth(units, cameras, *views.images.shape[2:])
-        return Outcome(encoded, units, fused, None)
+        return Outcome(encoded, units, fused)
     predicted = model.gaussians(views.images, cameras, encoded, units)
     rendered = render_targets(predicted.gaussians, views)
-    return Outcome(encoded, units, 1 / predicted.depth[:, None], rendered)
+    return Outcome(encoded, units, 1 / predicted.depth[:, None], predicted.gaussians.scales, rendered)
 
 
 def render_targets(gaussians: tuple[Tensor, ...], views: Views) -> Tensor:
@@ -99,7 +108,8 @@ def scene_loss(
             loss = loss + unit_loss(unit, of_layers, views.inverse_depth, bins)
         if phase.units == 3:
             loss = loss + inverse_depth_loss(outcome.inverse_depth, views.inverse_depth[:, None], bins)
-    if outcome.rendered is not None:
+    if outcome.rendered is not None and outcome.scales is not None:
+        loss = loss + splat_size_loss(outcome.scales, 1 / outcome.inverse_depth[:, 0], views.intrinsics)
         loss = loss + PHOTOMETRIC_SHARE * photometric_loss(outcome.rendered, views.target_images, perceptual)
     return loss, {"loss": float(loss.detach()), **entry}
 

@@ -1,0 +1,92 @@
+"""What two trivial methods make of a target view: the nearest photograph copied, and one plane between them warped.
+
+The plane stands upright before the target camera, and its depth is the one that comes closest to the target itself: no
+way of choosing a depth from the photographs alone can find a better one. A method that beats it has found relief.
+"""
+
+from math import ceil
+
+import numpy as np
+
+from .cases import Posed
+
+# Planes that are tried: at first neighbours move no pixel by much more than one, then around the best ones closer.
+FEWEST_PLANES, MOST_PLANES = 64, 1024
+KEPT = 3
+CLOSER = 8
+ROUNDS = 2
+TINY = 1e-9
+
+
+def nearest_view(context: Posed, extrinsics: np.ndarray) -> int:
+    """The context view whose camera stands nearest to the pose [4, 4]."""
+    return int(_distances(context, extrinsics).argmin())
+
+
+def best_plane(
+    context: Posed,
+    truth: np.ndarray,  # [height, width, 3]
+    valid: np.ndarray,  # [height, width]
+    extrinsics: np.ndarray,  # [4, 4]
+    K: np.ndarray,  # [3, 3]
+    near: float,
+    far: float,
+) -> tuple[np.ndarray, float]:
+    """The picture [height, width, 3] of the plane between near and far that is most like the truth, and its depth."""
+    low, high = 1 / far, 1 / near
+    pixels = float(max(_distances(context, extrinsics)) * K[0, 0] * (high - low))  # that the nearest plane moves
+    candidates = np.linspace(low, high, min(max(ceil(pixels), FEWEST_PLANES), MOST_PLANES) + 1)
+    step = candidates[1] - candidates[0]
+    errors: dict[float, float] = {}
+    for _ in range(ROUNDS + 1):
+        for inverse_depth in candidates:
+            picture = warp_plane(context, extrinsics, K, inverse_depth)
+            errors[inverse_depth] = float(np.square(picture - truth)[valid].mean())
+        best = np.array(sorted(errors, key=lambda inverse_depth: errors[inverse_depth])[:KEPT])
+        step /= CLOSER
+        around = best[:, None] + step * np.arange(1 - CLOSER, CLOSER)
+        candidates = np.setdiff1d(around.clip(low, high), list(errors))
+    return warp_plane(context, extrinsics, K, best[0]), float(1 / best[0])
+
+
+def warp_plane(context: Posed, extrinsics: np.ndarray, K: np.ndarray, inverse_depth: float) -> np.ndarray:
+    """The context views as a camera sees them if all they show lies on a plane at 1 / inverse_depth before it.
+
+    extrinsics: the camera's pose, [4, 4]. K: in pixels, [3, 3]. Views are mixed by their cameras' nearness, among those
+    that see a pixel; where none does, the pixel of the nearest view is copied. Returns [height, width, 3] float32.
+    """
+    height, width = context.valid.shape[1:]
+    weights = 1 / np.maximum(_distances(context, extrinsics), TINY)
+    mixed, total = np.zeros((height, width, 3), np.float32), np.zeros((height, width, 1), np.float32)
+    for view, weight in enumerate(weights / weights.sum()):
+        there = np.linalg.inv(context.extrinsics[view].astype(np.float64)) @ extrinsics
+        # A point of the plane in this camera: depth * (rotation + translation * normal / depth) @ ray.
+        flat = there[:3, :3] + inverse_depth * there[:3, 3:] * np.array([[0, 0, 1.0]])
+        picture, seen = _warped(context, view, context.K(view) @ flat @ np.linalg.inv(K))
+        share = (weight * seen)[..., None].astype(np.float32)
+        mixed += share * picture
+        total += share
+    copied = context.picture(nearest_view(context, extrinsics))
+    return np.where(total > 0, mixed / np.maximum(total, TINY), copied)
+
+
+def _warped(context: Posed, view: int, homography: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A view's picture under a homography from pixels (centres at .5) of the result, and where it is seen."""
+    import cv2
+
+    height, width = context.valid.shape[1:]
+    half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # OpenCV's pixel centres lie at whole numbers
+    maps = np.linalg.inv(half) @ homography @ half
+    size, inverse = (width, height), cv2.WARP_INVERSE_MAP
+    picture = np.ascontiguousarray(context.picture(view))
+    picture = cv2.warpPerspective(
+        picture, maps, size, flags=cv2.INTER_LINEAR | inverse, borderMode=cv2.BORDER_REPLICATE
+    )
+    seen = cv2.warpPerspective(context.valid[view].astype(np.uint8), maps, size, flags=cv2.INTER_NEAREST | inverse)
+    in_front = maps[2, 0] * np.arange(width) + maps[2, 1] * np.arange(height)[:, None] + maps[2, 2] > 0
+    return picture, (seen > 0) & in_front
+
+
+def _distances(context: Posed, extrinsics: np.ndarray) -> np.ndarray:
+    """From the pose [4, 4] to each context camera, in scene units, [views]."""
+    return np.linalg.norm(context.extrinsics[:, :3, 3] - extrinsics[:3, 3], axis=1)

@@ -1,0 +1,73 @@
+"""What is evaluated: views that a network is given, and views that it is to meet."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Posed:
+    """Pictures with their cameras at the network's size.
+
+    names: of the pictures, [views].
+    images: float32 RGB in [0, 1], [views, 3, height, width].
+    extrinsics: camera-to-world, OpenCV axes, [views, 4, 4].
+    intrinsics: row 0 divided by the width, row 1 by the height, [views, 3, 3].
+    valid: bool, [views, height, width]; False where the camera saw nothing and the picture was filled.
+    """
+
+    names: list[str]
+    images: np.ndarray
+    extrinsics: np.ndarray
+    intrinsics: np.ndarray
+    valid: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def picture(self, view: int) -> np.ndarray:
+        """One picture, [height, width, 3]."""
+        return self.images[view].transpose(1, 2, 0)
+
+    def K(self, view: int) -> np.ndarray:
+        """One view's intrinsics in pixels, pixel centres at .5, [3, 3], float64."""
+        height, width = self.images.shape[2:]
+        return np.diag([width, height, 1.0]) @ self.intrinsics[view]
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """Context views for a network, and target views of the same scene that it does not see.
+
+    near, far: scene units; None for the model's own. depth: true z-depth of the context views in scene units,
+    [views, height, width], not positive where unknown; None where there is none.
+    """
+
+    name: str
+    context: Posed
+    targets: Posed
+    near: float | None = None
+    far: float | None = None
+    depth: np.ndarray | None = None
+
+
+def procedural_case(seed: int, context: int, targets: int, height: int, width: int) -> Case:
+    """The procedural scene of `seed`, with exact depth; the same arguments give the same case."""
+    from .scenes import draw_sample
+
+    sample = draw_sample(seed, context, targets, height, width)
+
+    def posed(kind: str, views: slice) -> Posed:
+        images = sample.images[views]
+        names = [f"{kind}{index}" for index in range(len(images))]
+        valid = np.ones((len(images), height, width), bool)
+        return Posed(names, images, sample.extrinsics[views], sample.intrinsics[views], valid)
+
+    return Case(
+        str(seed),
+        posed("context", slice(context)),
+        posed("target", slice(context, None)),
+        sample.near,
+        sample.far,
+        sample.depth[:context],
+    )
