@@ -76,12 +76,17 @@ def undistort(image: np.ndarray, camera: Camera) -> tuple[np.ndarray, Camera]:
     """
     if camera.distortion is None:
         return image, camera
-    K = camera.K - HALF_PIXEL * np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]])
-    distortion = np.array(camera.distortion)
-    size = camera.width, camera.height
-    map_x, map_y = cv2.initUndistortRectifyMap(K, distortion, np.eye(3), K, size, cv2.CV_32FC1)
+    map_x, map_y = _undistortion_maps(camera)
     straight = cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return straight, replace(camera, distortion=None)
+
+
+def seen_by_lens(camera: Camera) -> np.ndarray:
+    """Where `undistort` shows what the lens saw, and nothing filled in: bool, [height, width]."""
+    if camera.distortion is None:
+        return np.ones((camera.height, camera.width), bool)
+    map_x, map_y = _undistortion_maps(camera)
+    return (map_x >= 0) & (map_x <= camera.width - 1) & (map_y >= 0) & (map_y <= camera.height - 1)
 
 
 def cover(width: int, height: int, target_width: int, target_height: int) -> Crop:
@@ -108,6 +113,13 @@ def fit(image: np.ndarray, K: np.ndarray, height: int, width: int) -> tuple[np.n
     pixels = np.ascontiguousarray(cut.transpose(2, 0, 1), dtype=np.float32) / np.float32(255)  # [3, height, width]
     intrinsics = np.diag([1 / width, 1 / height, 1]) @ crop.matrix @ K
     return pixels, intrinsics.astype(np.float32)
+
+
+def _undistortion_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """For each pixel of the undistorted picture, where it lies in the photograph, in OpenCV's pixel coordinates."""
+    K = camera.K - HALF_PIXEL * np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]])
+    size = camera.width, camera.height
+    return cv2.initUndistortRectifyMap(K, np.array(camera.distortion), np.eye(3), K, size, cv2.CV_32FC1)
 
 
 def _images_of(item: str | Path) -> list[Path]:

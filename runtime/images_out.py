@@ -14,14 +14,25 @@ def save_png(path: Path, rgb: np.ndarray) -> None:
 
     Raises InputError if the file cannot be written.
     """
-    _save(path, _to_bytes(rgb)[..., ::-1])
+    import cv2  # here, so that a command can say what it does without loading OpenCV
+
+    _, encoded = cv2.imencode(".png", _to_bytes(rgb)[..., ::-1])
+    with replacing(path) as temporary:
+        temporary.write_bytes(encoded.data)
 
 
 def save_depth_png(path: Path, depth: np.ndarray) -> None:
-    """Write depth in world units, [height, width], in colours from blue (far) to red (near), by inverse depth.
+    """Write depth in world units, [height, width], in the colours of `depth_colours`.
+
+    Raises InputError if the file cannot be written.
+    """
+    save_png(path, depth_colours(depth))
+
+
+def depth_colours(depth: np.ndarray) -> np.ndarray:
+    """Depth in world units, [height, width], as RGB in [0, 1] from blue (far) to red (near), by inverse depth.
 
     The nearest and farthest 2 % share the end colours. Depth that is not positive and finite becomes black.
-    Raises InputError if the file cannot be written.
     """
     import cv2
 
@@ -31,18 +42,9 @@ def save_depth_png(path: Path, depth: np.ndarray) -> None:
     warmth = (inverse_depth - far) / (near - far) if near > far else np.full(depth.shape, 0.5)
     picture = cv2.applyColorMap(_to_bytes(warmth), cv2.COLORMAP_TURBO)
     picture[~known] = 0
-    _save(path, picture)
+    return picture[..., ::-1].astype(np.float32) / 255
 
 
 def _to_bytes(values: np.ndarray) -> np.ndarray:
     """Numbers in [0, 1] as uint8, rounded."""
     return np.rint(np.clip(values, 0, 1) * 255).astype(np.uint8)
-
-
-def _save(path: Path, bgr: np.ndarray) -> None:
-    """Write OpenCV's kind of image as a PNG."""
-    import cv2  # here, so that a command can say what it does without loading OpenCV
-
-    _, encoded = cv2.imencode(".png", bgr)
-    with replacing(path) as temporary:
-        temporary.write_bytes(encoded.data)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from idesplat.runtime.cameras import Camera
 from idesplat.runtime.errors import InputError
-from idesplat.runtime.images import cover, find_images, fit, load_image, undistort
+from idesplat.runtime.images import cover, find_images, fit, load_image, seen_by_lens, undistort
 
 # rows of the upright picture, in RGB: red, green / blue, white / grey, black
 UPRIGHT = np.array(
@@ -226,6 +226,20 @@ def test_undistort_against_opencv_projection(distortion):
     for centre in expected:
         # OpenCV's remap rounds positions to 1/32 pixel
         np.testing.assert_allclose(centroid(straight[..., 0], centre, 13), centre, atol=1 / 64)
+
+
+def test_what_the_lens_saw_against_opencv_projection():
+    """A pixel of the straight picture was seen if its ray, bent by the lens, meets the photograph."""
+    K = np.array([[60.0, 0, 48], [0, 60, 36], [0, 0, 1]])
+    camera = Camera("a", 96, 72, K, np.eye(4), (0.2, 0.05, 0.002, -0.001))
+    x, y = np.meshgrid(np.arange(96) + 0.5, np.arange(72) + 0.5)
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ np.linalg.inv(K).T
+    bent = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, np.array(camera.distortion))[0].reshape(72, 96, 2)
+    # the photograph has no colour beyond its outermost pixel centres
+    expected = ((bent > 0.5) & (bent < (95.5, 71.5))).all(axis=-1)
+    assert 0.5 < expected.mean() < 0.95
+    assert (seen_by_lens(camera) == expected).mean() > 0.999
+    assert seen_by_lens(replace(camera, distortion=None)).all()
 
 
 def test_undistort_without_distortion_changes_nothing():
