@@ -129,6 +129,8 @@ def _describe(model: "IDESplat | DepthSplat", preset: str, checkpoint: Path, fix
         fixed_views=fixed.views or 0,
         near=config.near,
         far=config.far,
+        trained_views=list(config.trained_views),
+        trained_sides=list(config.trained_sides),
         sh_degree=config.sh_degree,
         checkpoint=checkpoint.name,
         checkpoint_sha256=digest,

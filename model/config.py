@@ -101,9 +101,18 @@ class EncoderConfig:
     # The depth range it was trained with, in scene units.
     near: float = 0.5
     far: float = 100.0
-    # The image size it was trained at.
+    # The image size it was trained at; a network that was trained at others, too, does best at this one.
     height: int = 256
     width: int = 256
+    # The fewest and the most views it was trained with, and the shortest and longest side of its images.
+    trained_views: tuple[int, int] = (2, 2)
+    other_sides: tuple[int, ...] = ()
+
+    @property
+    def trained_sides(self) -> tuple[int, int]:
+        """The shortest and the longest side of the images it was trained with, in pixels."""
+        sides = (self.height, self.width, *self.other_sides)
+        return min(sides), max(sides)
 
     @property
     def sh_coefficients(self) -> int:
@@ -177,7 +186,7 @@ _LARGE = DepthSplatConfig(scales=TWO_SCALES, vit=VIT_LARGE, upsampler=UPSAMPLER_
 PRESETS: dict[str, IDESplatConfig | DepthSplatConfig] = {
     "idesplat-re10k": IDESplatConfig(),
     "idesplat-acid": IDESplatConfig(),
-    "idesplat-dl3dv": IDESplatConfig(feature_stride=8, far=200.0, height=256, width=448),
+    "idesplat-dl3dv": IDESplatConfig(feature_stride=8, far=200.0, height=256, width=448, trained_views=(2, 6)),
     # Every part in small, for CPUs: 3.0 million parameters, trained from scratch, the ViT along.
     "idesplat-tiny": IDESplatConfig(
         backbone_channels=(24, 32, 48),
@@ -197,14 +206,22 @@ PRESETS: dict[str, IDESplatConfig | DepthSplatConfig] = {
         focus=FocusConfig(channels=48, window=8, topk=(64, 64, 32, 32)),
         # Procedural surfaces hardly shine: bands above the first would learn little, and double the .ply file.
         sh_degree=1,
+        # Its scenes have the unit in which near is 1, and far lies between 2 and 200.
+        near=1.0,
+        trained_views=(2, 3),
+        other_sides=(128,),
     ),
     "depthsplat-small-re10k": _SMALL,
     "depthsplat-base-re10k": _BASE,
     "depthsplat-large-re10k": _LARGE,
     "depthsplat-base-re10k-256x448": replace(_BASE_8, height=256, width=448),
-    "depthsplat-base-dl3dv": replace(_BASE_8, far=200.0, height=256, width=448),
-    "depthsplat-small-re10kdl3dv": replace(_SMALL_8, far=200.0, scale_max=0.1, height=448, width=768),
-    "depthsplat-base-re10kdl3dv": replace(_BASE_8, far=200.0, scale_max=0.1, height=448, width=768),
-    "depthsplat-depth-small": replace(_SMALL_8, gaussians=False, height=352, width=640),
-    "depthsplat-depth-base": replace(_BASE_8, gaussians=False, height=352, width=640),
+    "depthsplat-base-dl3dv": replace(_BASE_8, far=200.0, height=256, width=448, trained_views=(2, 6)),
+    "depthsplat-small-re10kdl3dv": replace(
+        _SMALL_8, far=200.0, scale_max=0.1, height=448, width=768, trained_views=(4, 10)
+    ),
+    "depthsplat-base-re10kdl3dv": replace(
+        _BASE_8, far=200.0, scale_max=0.1, height=448, width=768, trained_views=(2, 6)
+    ),
+    "depthsplat-depth-small": replace(_SMALL_8, gaussians=False, height=352, width=640, trained_views=(2, 8)),
+    "depthsplat-depth-base": replace(_BASE_8, gaussians=False, height=352, width=640, trained_views=(2, 8)),
 }

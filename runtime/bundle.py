@@ -34,6 +34,9 @@ class Description:
     # The range of depth it was trained with, in scene units.
     near: float
     far: float
+    # The fewest and the most views it was trained with, and the shortest and longest side of its images.
+    trained_views: list[int]
+    trained_sides: list[int]
     sh_degree: int
     checkpoint: str
     checkpoint_sha256: str
