@@ -4,7 +4,7 @@ import glob
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import cv2
 import numpy as np
@@ -46,6 +46,11 @@ def find_images(given: Sequence[str | Path]) -> list[Path]:
     return sorted(set(found), key=_natural)
 
 
+def stem(path: PurePath) -> str:
+    """The name without an image's suffix; `r_0.5` has none."""
+    return path.stem if path.suffix.lower() in SUFFIXES else path.name
+
+
 def load_image(path: Path) -> np.ndarray:
     """Read an image as uint8 RGB, [height, width, 3], turned as its EXIF tag says.
 
@@ -78,7 +83,7 @@ def undistort(image: np.ndarray, camera: Camera) -> tuple[np.ndarray, Camera]:
         return image, camera
     map_x, map_y = _undistortion_maps(camera)
     straight = cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return straight, replace(camera, distortion=None)
+    return straight, replace(camera, distortion=None, fisheye=False)
 
 
 def seen_by_lens(camera: Camera) -> np.ndarray:
@@ -119,7 +124,8 @@ def _undistortion_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """For each pixel of the undistorted picture, where it lies in the photograph, in OpenCV's pixel coordinates."""
     K = camera.K - HALF_PIXEL * np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]])
     size = camera.width, camera.height
-    return cv2.initUndistortRectifyMap(K, np.array(camera.distortion), np.eye(3), K, size, cv2.CV_32FC1)
+    lens = cv2.fisheye if camera.fisheye else cv2
+    return lens.initUndistortRectifyMap(K, np.array(camera.distortion), np.eye(3), K, size, cv2.CV_32FC1)
 
 
 def _images_of(item: str | Path) -> list[Path]:

@@ -3,14 +3,14 @@
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePath, PurePosixPath
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
 from .cameras import Camera, check_intrinsics, located, resized, rigid
 from .errors import InputError
-from .images import SUFFIXES, fit, load_image, undistort
+from .images import fit, load_image, stem, undistort
 
 FEWEST_VIEWS = 2
 EXAMPLES = 3  # names listed in a message
@@ -57,8 +57,8 @@ def match(images: Sequence[Path], cameras: Sequence[Camera]) -> list[tuple[Path,
     """
     by_stem: dict[str, list[Camera]] = defaultdict(list)
     for camera in cameras:
-        by_stem[_stem(_path(camera.name))].append(camera)
-    if not any(_stem(image) in by_stem for image in images):
+        by_stem[stem(_path(camera.name))].append(camera)
+    if not any(stem(image) in by_stem for image in images):
         raise InputError(
             f"none of {len(images)} images ({_examples(images)}) is named by one of {len(cameras)} cameras "
             f"({_examples([camera.name for camera in cameras])}); give the images that the cameras were made for"
@@ -66,7 +66,7 @@ def match(images: Sequence[Path], cameras: Sequence[Camera]) -> list[tuple[Path,
     taken: dict[str, Path] = {}
     pairs = []
     for image in images:
-        candidates = by_stem.get(_stem(image), [])
+        candidates = by_stem.get(stem(image), [])
         if not candidates:
             names = _examples([camera.name for camera in cameras])
             raise InputError(
@@ -164,11 +164,6 @@ def check_views(images: Any, extrinsics: Any, intrinsics: Any, near: Any, far: A
 
 def _path(name: str) -> PurePosixPath:
     return PurePosixPath(name.replace("\\", "/"))  # files written on Windows
-
-
-def _stem(path: PurePath) -> str:
-    """The name without an image's suffix; `r_0.5` has none."""
-    return path.stem if path.suffix.lower() in SUFFIXES else path.name
 
 
 def _best(image: Path, candidates: Sequence[Camera]) -> Camera:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from idesplat.runtime.cameras import Camera, read_cameras, resized, write_cameras
+from idesplat.runtime.cameras import Camera, CameraFormat, read_cameras, resized, write_cameras
 from idesplat.runtime.errors import InputError
 
 DISTORTION = (0.058, -0.081, -0.001, 0.0002)
@@ -219,9 +219,10 @@ MISTAKES = {
     "huge size": (set_frame(w=1e300), "size"),
     "only one side": (drop("h"), "h is missing"),
     "NaN distortion": (set_frame(k1=math.nan), "k1 is nan"),
-    "third coefficient": (set_frame(k3=0.1), "k3 is 0.1"),
-    "fisheye": (set_frame(camera_model="OPENCV_FISHEYE"), "camera_model is 'OPENCV_FISHEYE'"),
-    "fisheye of instant-ngp": (set_frame(is_fisheye=True), "is_fisheye"),
+    "fourth coefficient": (set_frame(k4=0.1), "k4 is 0.1, expected only k1, k2, p1, p2, k3"),
+    "tangential fisheye": (set_frame(camera_model="OPENCV_FISHEYE", p1=0.1), "p1 is 0.1, expected only k1, k2, k3, k4"),
+    "unknown lens": (set_frame(camera_model="EQUIRECTANGULAR"), "camera_model is 'EQUIRECTANGULAR'"),
+    "text as fisheye": (set_frame(is_fisheye="yes"), "is_fisheye is 'yes'"),
     "list as model": (set_frame(camera_model=[]), "camera_model"),
     "no name": (drop("file_path"), "file_path is missing"),
     "empty name": (set_frame(file_path=""), "file_path is ''"),
@@ -259,7 +260,7 @@ def test_names_must_differ(tmp_path, cameras):
 @pytest.mark.parametrize(
     ("content", "expected"),
     [
-        (b"", "not valid JSON"),
+        (b"", "is empty"),
         (b"{", "not valid JSON"),
         (b"\xff\xfe\xfa", "not valid JSON"),
         (b"\x89PNG\r\n\x1a\n", "not valid JSON"),
@@ -285,12 +286,14 @@ def test_files_that_hold_no_cameras(tmp_path, content, expected):
 def test_files_that_cannot_be_read(tmp_path):
     with pytest.raises(InputError, match=r"nowhere\.json: cannot be read"):
         read_cameras(tmp_path / "nowhere.json")
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="is a folder without"):
         read_cameras(tmp_path)
+    with pytest.raises(InputError, match="cannot be read"):
+        read_cameras(tmp_path, form=CameraFormat.OWN)
 
 
-@pytest.mark.parametrize("bad", [[1, 2, 3], "no", [1, 2, 3, None], {"k1": 1}])
-def test_own_format_distortion_is_four_numbers(tmp_path, cameras, bad):
+@pytest.mark.parametrize("bad", [[1, 2, 3], "no", [1, 2, 3, None], {"k1": 1}, [1] * 6])
+def test_own_format_distortion_is_a_list_of_numbers(tmp_path, cameras, bad):
     write_cameras(tmp_path / "c.json", cameras)
     document = json.loads((tmp_path / "c.json").read_text())
     document["cameras"][2]["distortion"] = bad
