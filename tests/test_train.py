@@ -2,12 +2,13 @@
 
 import json
 import math
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -25,12 +26,13 @@ from idesplat.model.config import (
     ViTConfig,
 )
 from idesplat.model.idesplat import IDESplat
-from idesplat.runtime.errors import EXIT_STATUS
+from idesplat.runtime.errors import EXIT_STATUS, InputError
 from idesplat.tools import losses, train
 from idesplat.tools.curriculum import Objective, Phase, curriculum, phase_at, rate_at
 from idesplat.tools.initialisation import new_model
 from idesplat.tools.train import CHECKPOINT, CURVES, LOG, PICTURES, Run, Settings
 from idesplat.tools.training_data import Order, drawn_ahead, training_order
+from idesplat.tools.training_folders import FolderScenes
 from idesplat.tools.training_log import TrainingLog
 from idesplat.tools.training_state import TrainingState
 from idesplat.tools.training_step import scene_loss
@@ -52,7 +54,7 @@ SMALL = IDESplatConfig(
     sh_degree=1,
 )
 EVERYTHING = Phase(1.0, units=3, gaussians=True, shrink=1)
-SETTINGS = Settings("small", "both", True, steps=8, batch=2, size=64, lr=1e-3, vit_lr=5e-4, seed=3, init="")
+SETTINGS = Settings("small", "both", True, steps=8, batch=2, size=64, lr=1e-3, vit_lr=5e-4, seed=3, init="", data=[])
 
 
 @pytest.fixture(autouse=True)
@@ -309,6 +311,8 @@ def test_bad_inputs_are_one_line_each(finished: Path, tmp_path: Path, capsys: py
     assert "idesplat-tiny" in refused(capsys, out=out, preset="idesplat-huge")
     assert "no such preset" in refused(capsys, out=out, preset="depthsplat-small-re10k")
     assert "multiple of 64" in refused(capsys, out=out, size=200)
+    assert "use photometric" in refused(capsys, out=out, data=[tmp_path])
+    assert "cannot be read" in refused(capsys, out=out, data=[tmp_path], objective=Objective.PHOTOMETRIC)
     assert "no such file" in refused(capsys, out=out, init=tmp_path / "absent.ckpt")
     assert "does not fit the network" in refused(capsys, out=out, init=finished / CHECKPOINT)
     assert "other settings" in refused(capsys, out=finished, steps=9)
@@ -318,6 +322,33 @@ def test_bad_inputs_are_one_line_each(finished: Path, tmp_path: Path, capsys: py
     assert "not a checkpoint of a training run" in refused(capsys, out=tmp_path)
     assert "cannot create the folder" in refused(capsys, out=tmp_path / CHECKPOINT / "below")
     assert not out.exists() or not list(out.iterdir())
+
+
+def test_photographs_are_trained_on_by_their_views_alone(scene: Path, tmp_path: Path) -> None:
+    settings = replace(SETTINGS, objective="photometric", steps=2, data=[str(scene)])
+    Run(tmp_path, settings, SMALL).go(save_every=1e9, validate_every=2)
+    entries = logged(tmp_path)
+    assert all(entry["psnr"] > 0 and "abs_rel" not in entry for entry in entries)
+    assert entries[-1]["validation_psnr"] > 0
+    assert cv2.imread(str(tmp_path / PICTURES)).shape == (4 * 64, 4 * 64, 3)
+
+
+def test_folders_are_drawn_from_as_ordered(scene: Path) -> None:
+    scenes = FolderScenes([scene], near=1, far=20)
+    order = Order(5, 2, 1, 64, 96)
+    first, again = scenes.draw(order), scenes.draw(order)
+    assert torch.equal(first.images, again.images) and torch.equal(first.target_images, again.target_images)
+    assert first.images.shape == (2, 3, 64, 96) and first.target_images.shape == (1, 3, 64, 96)
+    places = torch.cat([first.extrinsics, first.target_extrinsics])[:, :3, 3]
+    assert len(places.unique(dim=0)) == 3
+    with pytest.raises(InputError, match="5 photographs, expected at least 6"):
+        scenes.draw(Order(5, 4, 2, 64, 96))
+
+
+def test_folder_without_a_photograph_is_refused(scene: Path, tmp_path: Path) -> None:
+    shutil.copy(scene / "transforms.json", tmp_path)
+    with pytest.raises(InputError, match="which is not there"):
+        FolderScenes([tmp_path], near=1, far=20)
 
 
 def test_init_takes_weights_and_starts_from_step_zero(finished: Path) -> None:

@@ -7,7 +7,7 @@ had not been.
 import ctypes
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -25,6 +25,7 @@ if TYPE_CHECKING:  # torch and compiled code are loaded only once there is somet
 
 CHECKPOINT, LOG, CURVES, PICTURES = "last.ckpt", "log.jsonl", "curves.png", "predictions.png"
 CURVES_SHOWN = ("loss", "abs_rel", "validation_abs_rel", "validation_psnr", "gradient")
+SHOWN = {"loss": "loss", "AbsRel": "abs_rel", "PSNR": "psnr"}
 # glibc's mallopt parameters: without them every large tensor's memory goes back to the system and is cleared again.
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
 LARGE = 2**31 - 1
@@ -46,6 +47,7 @@ class Settings:
     vit_lr: float
     seed: int
     init: str
+    data: list[str]
 
 
 @exit_on_input_error
@@ -53,6 +55,9 @@ def train(
     out: Annotated[Path, typer.Option(help="Folder for checkpoint, log and pictures; a run in it is resumed.")],
     preset: Annotated[str, typer.Option(help="The network, one of the IDESplat presets.")] = "idesplat-tiny",
     init: Annotated[Path | None, typer.Option(help="Checkpoint to start from, released or own.")] = None,
+    data: Annotated[
+        list[Path] | None, typer.Option(help="Folder with photographs and transforms.json, instead of drawn scenes.")
+    ] = None,
     objective: Annotated[Objective, typer.Option(help="True depth, rendered novel views, or both.")] = Objective.BOTH,
     gradual: Annotated[
         bool, typer.Option(help="Coarse depth first, then finer, then Gaussians; else everything from the start.")
@@ -67,10 +72,9 @@ def train(
     save_every: Annotated[float, typer.Option(help="Minutes between checkpoints.", min=0)] = 3.0,
     validate_every: Annotated[int, typer.Option(help="Steps between validations.", min=1)] = 200,
 ) -> None:
-    """Train IDESplat on procedural scenes with exact depth and cameras."""
-    settings = Settings(
-        preset, objective.value, gradual, steps, batch, size, lr, vit_lr, seed, str(init.resolve()) if init else ""
-    )
+    """Train IDESplat on procedural scenes with exact depth and cameras, or on photographs."""
+    start, folders = str(init.resolve()) if init else "", [str(folder.resolve()) for folder in data or []]
+    settings = Settings(preset, objective.value, gradual, steps, batch, size, lr, vit_lr, seed, start, folders)
     config = _config(settings)
     _keep_memory()
     import torch
@@ -98,6 +102,7 @@ class Run:
         elif settings.init:
             self.state.start_from(Path(settings.init))
         self.log: TrainingLog = TrainingLog(folder / LOG, self.state.step)
+        self.draw: Callable[[Order], Views] = _source(settings, config)
         renders = any(phase.gaussians for phase in self.phases)
         self.perceptual: Perceptual | None = load_perceptual() if renders else None
 
@@ -108,7 +113,7 @@ class Run:
         saved = time.monotonic()
         bar = Bar(self.settings.steps, self.state.step)
         with bar.progress:
-            scenes = drawn_ahead(self.orders())
+            scenes = drawn_ahead(self.orders(), self.draw)
             while self.state.step < self.settings.steps:
                 entry = self.one_step(scenes)
                 if self.state.step % validate_every == 0 or self.state.step == self.settings.steps:
@@ -162,7 +167,7 @@ class Run:
 
         phase = self.phase(self.state.step - 1)
         side = self.settings.size // phase.shrink
-        found = validate(self.state.mean_model(), phase, side, self.folder / PICTURES)
+        found = validate(self.state.mean_model(), phase, side, self.draw, self.folder / PICTURES)
         self.log.draw_curves(self.folder / CURVES, CURVES_SHOWN)
         return {name: finite(value) for name, value in found.items()}
 
@@ -185,8 +190,9 @@ class Bar:
 
     def show(self, entry: dict[str, Any]) -> None:
         """Bring the bar to a step that has been logged."""
-        loss, abs_rel = (f"{entry[name]:.3f}" if entry[name] is not None else "-" for name in ("loss", "abs_rel"))
-        self.progress.update(self.task, completed=entry["step"], description=f"loss {loss}, AbsRel {abs_rel}")
+        shown = ((label, entry.get(name)) for label, name in SHOWN.items())
+        description = ", ".join(f"{label} {value:.3f}" for label, value in shown if value is not None)
+        self.progress.update(self.task, completed=entry["step"], description=description)
 
 
 def _config(settings: Settings) -> "IDESplatConfig":
@@ -196,12 +202,25 @@ def _config(settings: Settings) -> "IDESplatConfig":
     presets = {name: config for name, config in PRESETS.items() if isinstance(config, IDESplatConfig)}
     if settings.preset not in presets:
         raise InputError(f"--preset {settings.preset}: no such preset; choose one of {', '.join(presets)}")
+    if settings.data and settings.objective != Objective.PHOTOMETRIC:
+        raise InputError(f"--objective {settings.objective}: photographs have no true depth; use photometric")
     config = presets[settings.preset]
     phases = curriculum(Objective(settings.objective), settings.gradual)
     multiple = max(phase.shrink for phase in phases) * max(config.size_multiple, LEAST_SIDE)
     if settings.size % multiple:
         raise InputError(f"--size {settings.size}: must be a multiple of {multiple} for this preset and these phases")
     return config
+
+
+def _source(settings: Settings, config: "IDESplatConfig") -> "Callable[[Order], Views]":
+    """What draws the scenes: the given folders, or else the procedural ones."""
+    if not settings.data:
+        from .training_data import draw_views
+
+        return draw_views
+    from .training_folders import FolderScenes
+
+    return FolderScenes([Path(folder) for folder in settings.data], config.near, config.far).draw
 
 
 def _keep_memory() -> None:

@@ -1,7 +1,7 @@
 """Training scenes as tensors, drawn in the background in the order in which the steps use them."""
 
 from collections import deque
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -26,7 +26,7 @@ class Views:
     intrinsics: Tensor  # [context, 3, 3] normalised by width and height
     near: Tensor  # [context]
     far: Tensor  # [context]
-    inverse_depth: Tensor  # [context, H, W], the truth, in 1 / scene units
+    inverse_depth: Tensor | None  # [context, H, W], the truth, in 1 / scene units; photographs have none
     target_images: Tensor  # [targets, 3, H, W]
     target_extrinsics: Tensor  # [targets, 4, 4]
     target_intrinsics: Tensor  # [targets, 3, 3]
@@ -77,13 +77,13 @@ def training_order(seed: int, step: int, slot: int, targets: int, height: int, w
     return Order(int(rng.integers(TRAINING_SEEDS.start, TRAINING_SEEDS.stop)), context, targets, height, width)
 
 
-def drawn_ahead(orders: Iterator[Order]) -> Generator[Views]:
+def drawn_ahead(orders: Iterator[Order], draw: Callable[[Order], Views] = draw_views) -> Generator[Views]:
     """The scenes of `orders`, in that order, drawn by a thread while the caller is at work."""
     with ThreadPoolExecutor(1, thread_name_prefix="scenes") as pool:
         waiting: deque[Future[Views]] = deque()
         try:
             for order in orders:
-                waiting.append(pool.submit(draw_views, order))
+                waiting.append(pool.submit(draw, order))
                 if len(waiting) > AHEAD:
                     yield waiting.popleft().result()
             while waiting:

@@ -79,13 +79,16 @@ def _label(panel: np.ndarray, text: str, place: tuple[int, int]) -> None:
     cv2.putText(panel, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, INK, 1, cv2.LINE_AA)
 
 
-def strip(image: np.ndarray, truth: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+def strip(image: np.ndarray, truth: np.ndarray | None, predicted: np.ndarray) -> np.ndarray:
     """Photograph, true and predicted inverse depth in the same colours, relative error; [H, 4 * W, 3] BGR bytes.
 
-    image: RGB in [0, 1], [3, H, W]. truth, predicted: inverse depth, [H, W].
+    image: RGB in [0, 1], [3, H, W]. truth, predicted: inverse depth, [H, W]; without truth only the prediction follows.
     """
-    low, high = np.quantile(truth, (0.01, 0.99))
-    shown = [colours((x - low) / max(high - low, 1e-9), cv2.COLORMAP_TURBO) for x in (truth, predicted)]
+    low, high = np.quantile(predicted if truth is None else truth, (0.01, 0.99))
+    maps = [predicted] if truth is None else [truth, predicted]
+    shown = [colours((x - low) / max(high - low, 1e-9), cv2.COLORMAP_TURBO) for x in maps]
+    if truth is None:
+        return np.concatenate([picture(image), *shown], axis=1)
     error = np.abs(truth / np.maximum(predicted, 1e-9) - 1) / WORST_ERROR
     return np.concatenate([picture(image), *shown, colours(error, cv2.COLORMAP_INFERNO)], axis=1)
 

@@ -100,7 +100,7 @@ def scene_loss(
         outcome = run_phase(model, views, phase)
     loss = torch.zeros(())
     entry = measures(outcome, views)
-    if objective is not Objective.PHOTOMETRIC:
+    if objective is not Objective.PHOTOMETRIC and views.inverse_depth is not None:
         bins = coarse_bin(model.config, views.near, views.far)
         loss = loss + monocular_loss(outcome.encoded, views.inverse_depth)
         for index, unit in enumerate(outcome.units):
@@ -118,11 +118,13 @@ def scene_loss(
 def measures(outcome: Outcome, views: Views) -> dict[str, float]:
     """AbsRel (mean of |D / D* - 1|) and the share of pixels within 5 % at the size of the images; PSNR of novel views.
 
-    Pixels that only one view sees are counted too.
+    Pixels that only one view sees are counted too. Photographs have no true depth.
     """
-    inverse_depth = resize(outcome.inverse_depth, *views.images.shape[2:])[:, 0]
-    error = (views.inverse_depth / inverse_depth - 1).abs()
-    entry = {"abs_rel": float(error.mean()), "within": float((error < WITHIN).float().mean())}
+    entry = {}
+    if views.inverse_depth is not None:
+        inverse_depth = resize(outcome.inverse_depth, *views.images.shape[2:])[:, 0]
+        error = (views.inverse_depth / inverse_depth - 1).abs()
+        entry = {"abs_rel": float(error.mean()), "within": float((error < WITHIN).float().mean())}
     if outcome.rendered is not None:
         entry["psnr"] = float(-10 * (outcome.rendered - views.target_images).square().mean().log10())
     return entry

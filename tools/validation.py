@@ -1,5 +1,6 @@
 """How well a network in training does on the validation scenes, in numbers and in pictures."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from ..model.idesplat import IDESplat
 from ..model.layers import resize
 from .curriculum import Phase
 from .scenes import VALIDATION_SEEDS
-from .training_data import Order, Views, draw_views
+from .training_data import Order, Views
 from .training_log import picture, strip, write_rows
 from .training_step import Outcome, measures, run_phase
 
@@ -18,12 +19,14 @@ PICTURED = 4
 
 
 @torch.no_grad()
-def validate(model: IDESplat, phase: Phase, side: int, pictures: Path) -> dict[str, float]:
+def validate(
+    model: IDESplat, phase: Phase, side: int, draw: Callable[[Order], Views], pictures: Path
+) -> dict[str, float]:
     """The mean measures of the first validation scenes, of two context views of `side` pixels; writes `pictures`."""
     entries: list[dict[str, float]] = []
     rows: list[np.ndarray] = []
     for seed in VALIDATION_SEEDS[:SCENES]:
-        views = draw_views(Order(seed, 2, int(phase.gaussians), side, side))
+        views = draw(Order(seed, 2, int(phase.gaussians), side, side))
         outcome = run_phase(model, views, phase)
         entries.append(measures(outcome, views))
         if len(rows) < PICTURED:
@@ -35,7 +38,8 @@ def validate(model: IDESplat, phase: Phase, side: int, pictures: Path) -> dict[s
 def _row(views: Views, outcome: Outcome) -> np.ndarray:
     """Photograph, truth, prediction and error of the first view, then the first novel view and its rendering."""
     predicted = resize(outcome.inverse_depth, *views.images.shape[2:])[0, 0]
-    row = [strip(views.images[0].numpy(), views.inverse_depth[0].numpy(), predicted.numpy())]
+    truth = None if views.inverse_depth is None else views.inverse_depth[0].numpy()
+    row = [strip(views.images[0].numpy(), truth, predicted.numpy())]
     if outcome.rendered is not None:
         row += [picture(views.target_images[0].numpy()), picture(outcome.rendered[0].numpy())]
     return np.concatenate(row, axis=1)
