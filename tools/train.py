@@ -101,8 +101,8 @@ class Run:
             self.state.resume(folder / CHECKPOINT, asdict(settings))
         elif settings.init:
             self.state.start_from(Path(settings.init))
-        self.log: TrainingLog = TrainingLog(folder / LOG, self.state.step)
         self.draw: Callable[[Order], Views] = _source(settings, config)
+        self.log: TrainingLog = TrainingLog(folder / LOG, self.state.step)
         renders = any(phase.gaussians for phase in self.phases)
         self.perceptual: Perceptual | None = load_perceptual() if renders else None
 
