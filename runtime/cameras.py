@@ -25,7 +25,7 @@ DISTORTION_LENGTHS = (4, 5, 8, 12, 14)  # that OpenCV's model may have
 FISHEYE_LENGTH = 4
 START = 4096  # bytes of a file that tell its format
 RE10K_COLUMNS = 19
-COLMAP_NAMES = ("cameras", "images", "frames", "rigs", "points3D")
+COLMAP_PARTS = ("cameras", "images", "frames", "rigs", "points3D")
 
 
 class CameraFormat(StrEnum):
@@ -50,7 +50,7 @@ class Camera:
     extrinsics: float64, camera-to-world, OpenCV axes (x right, y down, z forward), world units, [4, 4].
     distortion: OpenCV's coefficients, k1 k2 p1 p2 and on as it orders them (4, 5, 8, 12 or 14), or None for a pinhole.
     fisheye: the lens is one of cv2.fisheye's, and distortion its k1 k2 k3 k4.
-    depth_range: nearest and farthest depth that it is known to see, in world units, or None.
+    depth_range: near and far, between which all lies that it sees, in world units; None where that is not known.
 
     Raises InputError if a value is not finite or not plausible, or the pose is not rigid.
     A rotation that is off by rounding only (1e-3) is made orthonormal.
@@ -117,7 +117,7 @@ def recognise(path: Path) -> CameraFormat:
     """The format of a file or folder of cameras, by what it holds; raises InputError if it is none of them."""
     if path.is_dir():
         return _recognise_folder(path)
-    if path.name in {name + suffix for name in COLMAP_NAMES for suffix in (".bin", ".txt")}:
+    if path.name in {name + suffix for name in COLMAP_PARTS for suffix in (".bin", ".txt")}:
         return CameraFormat.COLMAP
     try:
         with path.open("rb") as file:

@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .camera_fields import calibration
-from .cameras import Camera, invert_rigid, located
+from .cameras import COLMAP_PARTS, Camera, invert_rigid, located
 from .errors import InputError
+from .sparse_depth import range_of_depths
 
 if TYPE_CHECKING:
     import pycolmap
@@ -46,7 +47,7 @@ FISHEYE = {
 }
 
 DEPTHS_USED = 4000  # of one image
-NEAREST_SHARE, FARTHEST_SHARE = 1, 99  # percentiles: a few of COLMAP's points are wrong
+COUNT_BYTES, SMALLEST_RECORD = 8, 8
 SECONDS, SECONDS_PER_MB = 20, 2
 MEMORY, MEMORY_PER_BYTE = 4 << 30, 40
 INSTALL = 'pip install "idesplat[colmap]"'
@@ -88,7 +89,9 @@ def _read_apart(model: Path) -> list[dict[str, Any]]:
     """What `_images` finds, through a process that may fail in any way."""
     if importlib.util.find_spec("pycolmap") is None:
         raise InputError(f"is a COLMAP model, for which pycolmap is needed; {INSTALL}")
-    size = sum(file.stat().st_size for file in model.iterdir() if file.suffix in SUFFIXES)
+    files = [file for file in model.iterdir() if file.suffix in SUFFIXES]
+    _check_counts(files)
+    size = sum(file.stat().st_size for file in files)
     command = [sys.executable, "-m", __name__, str(model), str(MEMORY + MEMORY_PER_BYTE * size)]
     try:
         done = subprocess.run(command, capture_output=True, timeout=SECONDS + SECONDS_PER_MB * size / 1e6)
@@ -101,6 +104,18 @@ def _read_apart(model: Path) -> list[dict[str, Any]]:
     if not images:
         raise InputError("holds no registered image, expected a model with poses; is the reconstruction complete?")
     return images
+
+
+def _check_counts(files: Sequence[Path]) -> None:
+    """Refuse a binary file whose first number, the count of its records, promises more than the file can hold."""
+    for file in files:
+        if file.suffix == ".bin" and file.stem in COLMAP_PARTS:
+            with file.open("rb") as opened:
+                count = int.from_bytes(opened.read(COUNT_BYTES), "little")
+            if count * SMALLEST_RECORD > file.stat().st_size:
+                raise InputError(
+                    f"{file.name} has room for fewer than the {count} records that it promises: cut off or damaged"
+                )
 
 
 def _camera(image: dict[str, Any]) -> Camera:
@@ -155,19 +170,15 @@ def _images(model: str) -> list[dict[str, Any]]:
     return found
 
 
-def depth_range(reconstruction: "pycolmap.Reconstruction", image: "pycolmap.Image") -> list[float] | None:
-    """Nearest and farthest depth of the points that an image observes, or None if there are too few."""
+def depth_range(reconstruction: "pycolmap.Reconstruction", image: "pycolmap.Image") -> tuple[float, float] | None:
+    """Near and far from the points that an image observes, or None if there are too few."""
     observed = [point.point3D_id for point in image.get_observation_points2D()]
     observed = observed[:: max(1, len(observed) // DEPTHS_USED)]
     if not observed:
         return None
     points = np.array([reconstruction.point3D(identity).xyz for identity in observed])  # [points, 3]
     depth = points @ image.cam_from_world().matrix()[2, :3] + image.cam_from_world().matrix()[2, 3]
-    depth = depth[np.isfinite(depth) & (depth > 0)]
-    if len(depth) == 0:
-        return None
-    nearest, farthest = np.percentile(depth, (NEAREST_SHARE, FARTHEST_SHARE)).tolist()
-    return [nearest, farthest] if 0 < nearest < farthest else None
+    return range_of_depths(depth)
 
 
 def _limit_memory(limit: int) -> None:

@@ -1,8 +1,8 @@
 """LLFF's poses_bounds.npy: a row of 17 numbers for each photograph, in the order of their names.
 
 A row is a 3 x 5 matrix and two depths. The matrix holds a camera-to-world pose, whose axes point down, right and
-backwards, and a column of height, width and focal length in pixels; the depths are the nearest and the farthest that
-the photograph shows. The principal point is the middle. The file names no photographs.
+backwards, and a column of height, width and focal length in pixels; the principal point is the middle. The depths are
+of the nearest and the farthest of COLMAP's points, so that near and far get some room. No photographs are named.
 """
 
 from collections.abc import Sequence
@@ -16,6 +16,7 @@ from .errors import InputError
 
 FILE_NAME = "poses_bounds.npy"
 COLUMNS = 17
+NEAR_ROOM, FAR_ROOM = 0.75, 1.5
 IMAGE_FOLDERS = ("images", "images_4", "images_8")
 
 
@@ -39,7 +40,8 @@ def _camera(name: str, row: np.ndarray) -> Camera:
     pose = np.eye(4)
     pose[:3] = np.stack([right, down, -backwards, position], axis=1)
     K = calibration(focal, focal, width / 2, height / 2)
-    return Camera(name, int(width), int(height), K, pose, depth_range=(float(row[15]), float(row[16])))
+    near, far = float(row[15]), float(row[16])
+    return Camera(name, int(width), int(height), K, pose, depth_range=(NEAR_ROOM * near, FAR_ROOM * far))
 
 
 def _rows(path: Path) -> np.ndarray:

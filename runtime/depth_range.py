@@ -1,0 +1,113 @@
+"""Near and far: from what the cameras are known to see, from points matched between the views, or from the baseline."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from .cameras import Camera, invert_rigid
+from .errors import InputError
+from .matching import Features, epipolar_error, find_features, match_features, parallax, rays_of, triangulate
+from .sparse_depth import range_of_depths
+
+EPIPOLAR_ERROR = 1.5  # pixels
+SMALLEST_PARALLAX_DEG = 0.3  # below, a triangulated depth is noise
+
+
+@dataclass(frozen=True)
+class DepthRange:
+    """near, far: scene units. source: where they come from, in words."""
+
+    near: float
+    far: float
+    source: str
+
+
+def find_depth_range(
+    images: np.ndarray,  # [views, 3, height, width], RGB in [0, 1]
+    extrinsics: np.ndarray,  # [views, 4, 4]
+    intrinsics: np.ndarray,  # [views, 3, 3], normalised
+    cameras: Iterable[Camera],
+    trained: tuple[float, float],
+    near: float | None = None,
+    far: float | None = None,
+) -> DepthRange:
+    """Near and far of these views; what is given stays.
+
+    Ranges that the cameras know go first, then points matched between the views and triangulated. Where there are too
+    few of them, near is the longest distance of a view from its nearest neighbour: what is closer is seen from
+    directions so different that nothing would match; far is then as many times near as in `trained`, the near and far
+    of the model's training.
+    Raises InputError if the result is not 0 < near < far.
+    """
+    if near is not None and far is not None:
+        return _checked(DepthRange(near, far, "given"))
+    found = _known(cameras) or _matched(images, extrinsics, intrinsics) or _from_baseline(extrinsics, trained)
+    if near is not None:
+        found = DepthRange(near, found.far, f"near given, far from {found.source}")
+    elif far is not None:
+        found = DepthRange(found.near, far, f"far given, near from {found.source}")
+    return _checked(found)
+
+
+def _checked(found: DepthRange) -> DepthRange:
+    if not 0 < found.near < found.far:
+        raise InputError(
+            f"near {found.near:g} and far {found.far:g} ({found.source}): expected 0 < near < far; "
+            "give --near and --far, in the unit of the cameras' positions"
+        )
+    return found
+
+
+def _known(cameras: Iterable[Camera]) -> DepthRange | None:
+    ranges = [camera.depth_range for camera in cameras if camera.depth_range is not None]
+    if not ranges:
+        return None
+    return DepthRange(
+        min(near for near, _ in ranges), max(far for _, far in ranges), "what the cameras are known to see"
+    )
+
+
+def _matched(images: np.ndarray, extrinsics: np.ndarray, intrinsics: np.ndarray) -> DepthRange | None:
+    height, width = images.shape[2:]
+    pictures = np.rint(np.clip(images, 0, 1) * 255).astype(np.uint8).transpose(0, 2, 3, 1)
+    features = [find_features(np.ascontiguousarray(picture)) for picture in pictures]
+    K = np.array([[width], [height], [1]]) * intrinsics.astype(np.float64)  # [views, 3, 3]
+    depths = [np.zeros(0)]
+    for i, j in neighbours(extrinsics):
+        depths += depths_of_pair(features[i], features[j], K[i], K[j], invert_rigid(extrinsics[j]) @ extrinsics[i])
+    depth = np.concatenate(depths)  # two depths for each point
+    found = range_of_depths(depth)
+    return found and DepthRange(*found, f"{len(depth) // 2} points matched between the photographs")
+
+
+def depths_of_pair(
+    first: Features, second: Features, first_K: np.ndarray, second_K: np.ndarray, second_from_first: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Depths [points] in the first and in the second view of the points that both see, by their known cameras.
+
+    Ks [3, 3] in pixels. second_from_first: takes points from the first camera's frame to the second's, [4, 4].
+    """
+    pairs = match_features(first, second)
+    a, b = rays_of(first.places[pairs[:, 0]], first_K), rays_of(second.places[pairs[:, 1]], second_K)
+    pixel = 1 / np.sqrt(first_K[0, 0] * second_K[0, 0])
+    fits = epipolar_error(a, b, second_from_first) < EPIPOLAR_ERROR * pixel
+    points = triangulate(a[fits], b[fits], second_from_first)
+    there = points @ second_from_first[:3, :3].T + second_from_first[:3, 3]
+    angle = parallax(points, invert_rigid(second_from_first)[:3, 3])
+    seen = (points[:, 2] > 0) & (there[:, 2] > 0) & (angle > SMALLEST_PARALLAX_DEG)
+    return points[seen, 2], there[seen, 2]
+
+
+def neighbours(extrinsics: np.ndarray) -> list[tuple[int, int]]:
+    """Each view with the one nearest to it, pairs of indices, each pair once."""
+    positions = extrinsics[:, :3, 3]
+    distances = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
+    np.fill_diagonal(distances, np.inf)
+    return sorted({(min(i, j), max(i, j)) for i, j in enumerate(distances.argmin(axis=1).tolist())})
+
+
+def _from_baseline(extrinsics: np.ndarray, trained: tuple[float, float]) -> DepthRange:
+    positions = extrinsics[:, :3, 3]
+    baseline = max(float(np.linalg.norm(positions[i] - positions[j])) for i, j in neighbours(extrinsics))
+    return DepthRange(baseline, baseline * trained[1] / trained[0], "the baseline")
