@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from .cameras import Camera, read_cameras
     from .errors import InputError
+    from .formats import read_scene, write_scene
     from .gaussians import Gaussians
     from .ply import read_ply, write_ply
     from .rasterizer import rasterize
@@ -23,7 +24,9 @@ _MODULE_OF = {
     "rasterize": "rasterizer",
     "read_cameras": "cameras",
     "read_ply": "ply",
+    "read_scene": "formats",
     "write_ply": "ply",
+    "write_scene": "formats",
 }
 
 __all__ = [
@@ -35,7 +38,9 @@ __all__ = [
     "rasterize",
     "read_cameras",
     "read_ply",
+    "read_scene",
     "write_ply",
+    "write_scene",
 ]
 
 

@@ -29,7 +29,7 @@ PATH_FRAMES = 24
 def infer(
     images: Annotated[list[Path], typer.Option(help="Folder, glob or files of photographs.", show_default=False)],
     cameras: Annotated[Path, typer.Option(help="transforms.json, or this project's cameras JSON.", show_default=False)],
-    out: Annotated[Path, typer.Option(help="Splat file to write (.ply).", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Splat file: .ply, .compressed.ply, .splat or .spz.", show_default=False)],
     model: Annotated[Path, typer.Option(help="A .onnx or staged folder of idesplat-export.", show_default=False)],
     more_images: Annotated[list[Path] | None, typer.Argument(hidden=True)] = None,
     views: Annotated[
@@ -74,8 +74,9 @@ def main() -> None:
 
 def _check_outputs(out: Path, save_depth: Path | None, render: Path | None, json_path: Path | None) -> None:
     """Find out before the work whether the results can be written."""
-    if out.suffix != ".ply":
-        raise InputError(f"--out {out}: expected a file that ends in .ply")
+    from .formats import scene_suffix
+
+    scene_suffix(out)
     for path in (out, json_path):
         if path is not None:
             if path.is_dir():
@@ -123,10 +124,11 @@ def _write(
     prediction: "Prediction", views: "Views", out: Path, save_depth: Path | None, render: Path | None
 ) -> list[Path]:
     """Write the splat file and what else was asked for; the paths written."""
-    from .ply import write_ply
+    from .formats import write_scene
 
     stems = _stems(views.names)
-    write_ply(out, prediction.gaussians)
+    for note in write_scene(out, prediction.gaussians):
+        print(f"note: {note}")
     written = [out]
     if save_depth is not None:
         written += _write_depth(prediction.depth, stems, save_depth)

@@ -34,6 +34,14 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def read_bytes(path: Path, expected: str) -> bytes:
+    """The content of a file; raises InputError, naming what was expected, where it cannot be read."""
+    try:
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}; expected {expected}") from None
+
+
 def make_folder(path: Path) -> Path:
     """Create `path` and its parents; raises InputError where that is not possible."""
     try:

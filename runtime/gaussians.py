@@ -1,11 +1,14 @@
 """The Gaussians: what the model predicts, the files hold and the rasteriser draws."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from math import isqrt
+from pathlib import Path
 
 import numpy as np
 
-from .errors import InputError
+from .errors import InputError, refuse
+
+SH_0 = 0.28209479177387814  # the spherical harmonic of degree 0: colour is 0.5 + SH_0 * sh[:, 0]
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,7 @@ class Gaussians:
                 raise InputError(f"Gaussians: {name} has shape {getattr(self, name).shape}, expected {shape}")
         if self.sh.ndim != 3 or self.sh.shape[0] != count or self.sh.shape[2] != 3:
             raise InputError(f"Gaussians: sh has shape {self.sh.shape}, expected ({count}, coefficients, 3)")
-        if isqrt(self.sh.shape[1]) ** 2 != self.sh.shape[1]:
+        if self.sh.shape[1] not in (1, 4, 9, 16):
             raise InputError(f"Gaussians: sh has {self.sh.shape[1]} coefficients, expected 1, 4, 9 or 16")
 
     def __len__(self) -> int:
@@ -43,3 +46,33 @@ class Gaussians:
     def sh_degree(self) -> int:
         """Degree of the spherical harmonics, 0 to 3."""
         return isqrt(self.sh.shape[1]) - 1
+
+    @property
+    def colours(self) -> np.ndarray:
+        """Red, green and blue without the part that changes with the direction, usually in [0, 1], [gaussians, 3]."""
+        return 0.5 + np.float32(SH_0) * self.sh[:, 0]
+
+
+def check_ranges(path: Path, gaussians: Gaussians) -> None:
+    """Raise InputError for values in a file's units instead of ours, before they are written to it."""
+    if (gaussians.scales < 0).any():
+        raise InputError(f"cannot write {path}: scales holds negative values; pass standard deviations, not logarithms")
+    if ((gaussians.opacities < 0) | (gaussians.opacities > 1)).any():
+        raise InputError(f"cannot write {path}: opacities holds values outside [0, 1]; pass opacities, not logits")
+
+
+def check_finite(path: Path, gaussians: Gaussians) -> None:
+    """Raise InputError for the first value, on its way to or from a file, that is not finite."""
+    for field in fields(gaussians):
+        finite = np.isfinite(getattr(gaussians, field.name))
+        if not finite.all():
+            at = int(np.argwhere(~finite)[0, 0])
+            refuse(path, f"{field.name} of Gaussian {at} is not a finite number", "leave that Gaussian out")
+
+
+def with_colours(
+    means: np.ndarray, scales: np.ndarray, quats: np.ndarray, opacities: np.ndarray, colours: np.ndarray
+) -> Gaussians:
+    """Gaussians of the same colour [gaussians, 3] from all sides, as float32 arrays."""
+    sh = (colours[:, None] - 0.5) / SH_0
+    return Gaussians(*(np.ascontiguousarray(array, np.float32) for array in (means, scales, quats, opacities, sh)))

@@ -15,7 +15,7 @@ import numpy as np
 
 from .errors import InputError, refuse
 from .files import replacing
-from .gaussians import Gaussians
+from .gaussians import Gaussians, check_ranges
 from .ply_header import LIST, Element, read_header
 
 VERTICES_AT_ONCE = 1 << 13  # their rows stay in the cache while columns are filled one by one
@@ -29,10 +29,7 @@ def write_ply(path: Path, gaussians: Gaussians) -> None:
     Opacities are kept 1e-6 away from 0 and 1, so that their logit is finite. Raises InputError if a value is not
     finite, a scale is negative, an opacity outside [0, 1], or the file cannot be written.
     """
-    if (gaussians.scales < 0).any():
-        raise InputError(f"cannot write {path}: scales holds negative values; pass standard deviations, not logarithms")
-    if ((gaussians.opacities < 0) | (gaussians.opacities > 1)).any():
-        raise InputError(f"cannot write {path}: opacities holds values outside [0, 1]; pass opacities, not logits")
+    check_ranges(path, gaussians)
     names = list(_columns(gaussians))
     names[3:3] = ["nx", "ny", "nz"]  # gaussforge and some older viewers insist on normals
     properties = "".join(f"property float {name}\n" for name in names)

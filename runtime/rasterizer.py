@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
 from .errors import InputError
+from .gaussians import SH_0
 
 DILATION = 0.3  # px^2, added to the projected covariance: no splat is thinner than a pixel
 FIELD_OF_VIEW_MARGIN = 0.3  # share of the half image by which the Jacobian's direction may leave the image
@@ -33,7 +34,6 @@ MAX_PIXELS = 1 << 27  # 20 bytes each, and as much again while the results are p
 MIN_BANDS = 8  # several a core, so that the cores finish together
 MOST_THREADS = 8  # each holds the fragments of a chunk, some 30 MB
 
-SH_0 = 0.28209479177387814
 SH_1 = 0.4886025119029199
 SH_2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 SH_3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)

@@ -11,9 +11,9 @@ import typer
 from .cameras import Camera, read_cameras
 from .errors import InputError, exit_on_input_error
 from .files import make_folder
+from .formats import read_scene
 from .gaussians import Gaussians
 from .images_out import save_png
-from .ply import read_ply
 from .rasterizer import Rendering, rasterize
 
 BLACK = (0.0, 0.0, 0.0)
@@ -55,7 +55,7 @@ def world_to_camera(extrinsics: np.ndarray) -> np.ndarray:
 
 @exit_on_input_error
 def render(
-    scene: Annotated[Path, typer.Argument(help="Splat file (.ply).", show_default=False)],
+    scene: Annotated[Path, typer.Argument(help="Splat file of any format.", show_default=False)],
     cameras: Annotated[Path, typer.Option(help="Cameras, such as a transforms.json.", show_default=False)],
     out: Annotated[Path, typer.Option(help="Folder for the pictures.", show_default=False)],
     background: Annotated[
@@ -71,7 +71,7 @@ def render(
         raise InputError(f"--background is {background}, expected red, green and blue from 0 to 1")
     views = read_cameras(cameras)
     targets = _targets(views, cameras.parent, out)
-    gaussians = read_ply(scene)
+    gaussians = read_scene(scene)
     make_folder(out)
     for view, target in _with_progress(list(zip(views, targets, strict=True))):
         save_png(target, draw_view(gaussians, view.extrinsics, view.K, view.width, view.height, background).rgb)

@@ -145,7 +145,7 @@ def test_pictures_never_overwrite_photographs(
     ("scene", "cameras", "background", "message"),
     [
         ("none.ply", "cameras.json", (0, 0, 0), "none.ply: No such file"),
-        ("cameras.json", "cameras.json", (0, 0, 0), "not a .ply file"),
+        ("cameras.json", "cameras.json", (0, 0, 0), "cameras.json: expected a splat file"),
         ("scene.ply", "none.json", (0, 0, 0), "none.json"),
         ("scene.ply", "scene.ply", (0, 0, 0), "not valid JSON"),
         ("scene.ply", "cameras.json", (0, 255, 0), "--background is (0.0, 255.0, 0.0)"),

@@ -1,0 +1,35 @@
+"""The command idesplat-convert: one splat file to another."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from .errors import InputError, exit_on_input_error
+
+
+@exit_on_input_error
+def convert(
+    scene: Annotated[Path, typer.Argument(help="Splat file to read.", show_default=False)],
+    out: Annotated[Path, typer.Argument(help="File to write.", show_default=False)],
+) -> None:
+    """Write a splat file in another format, which follows from the file's name.
+
+    .ply, .compressed.ply, .splat and .spz are read and written. What a format cannot hold is named.
+    """
+    from .files import check_writable
+    from .formats import read_scene, scene_suffix, write_scene
+
+    scene_suffix(out)
+    check_writable(out.parent)
+    if scene.exists() and out.exists() and scene.samefile(out):
+        raise InputError(f"{out}: is the file to read; choose another one to write")
+    gaussians = read_scene(scene)
+    for note in write_scene(out, gaussians):
+        print(f"note: {note}")
+    print(f"wrote {out}: {len(gaussians):,} Gaussians, {out.stat().st_size / 1e6:.1f} MB")
+
+
+def main() -> None:
+    """Entry point of idesplat-convert."""
+    typer.run(convert)

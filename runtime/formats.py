@@ -1,0 +1,67 @@
+"""Every file that Gaussians are written to or read from, chosen by the ending of its name.
+
+To add a format, write one file with a writer and a reader, and one line here.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from .compressed_ply import read_compressed_ply, write_compressed_ply
+from .errors import InputError
+from .gaussians import Gaussians
+from .ply import read_ply, write_ply
+from .ply_header import has_element
+from .splat import read_splat, write_splat
+from .spz import read_spz, write_spz
+
+
+class SceneFormat(NamedTuple):
+    """How Gaussians become one kind of file and come back.
+
+    write: returns a line for each thing that the file does not hold.
+    """
+
+    write: Callable[[Path, Gaussians], list[str]]
+    read: Callable[[Path], Gaussians]
+
+
+def _write_ply(path: Path, gaussians: Gaussians) -> list[str]:
+    write_ply(path, gaussians)
+    return []
+
+
+def _read_ply(path: Path) -> Gaussians:
+    """Either layout: a compressed .ply need not be named so."""
+    return read_compressed_ply(path) if has_element(path, "chunk") else read_ply(path)
+
+
+FORMATS = {
+    ".ply": SceneFormat(_write_ply, _read_ply),
+    ".compressed.ply": SceneFormat(write_compressed_ply, _read_ply),
+    ".splat": SceneFormat(write_splat, read_splat),
+    ".spz": SceneFormat(write_spz, read_spz),
+}
+
+
+def write_scene(path: Path, gaussians: Gaussians) -> list[str]:
+    """Write Gaussians in the format that the file's name asks for; the file appears whole or not at all.
+
+    Returns a line for each thing that the format cannot hold, such as spherical harmonics.
+    Raises InputError for an unknown name, values that no file can hold, or a place that cannot be written.
+    """
+    return FORMATS[scene_suffix(path)].write(Path(path), gaussians)
+
+
+def read_scene(path: Path) -> Gaussians:
+    """Read Gaussians from a file in any of the formats; raises InputError if that is not possible."""
+    return FORMATS[scene_suffix(path)].read(Path(path))
+
+
+def scene_suffix(path: Path) -> str:
+    """The longest ending of a file's name that stands for a format; raises InputError if there is none."""
+    name = Path(path).name.lower()
+    endings = [suffix for suffix in FORMATS if name.endswith(suffix)]
+    if not endings:
+        raise InputError(f"{path}: expected a splat file, whose name ends in {', '.join(FORMATS)}")
+    return max(endings, key=len)

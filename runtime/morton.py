@@ -1,0 +1,26 @@
+"""An order of points in which neighbours in space are neighbours in a file."""
+
+import numpy as np
+
+BITS = 21  # a coordinate: three fill 63
+# Shifts and masks that pull the bits of a number apart, two zeros between any two of them.
+SPREAD = (
+    (32, 0x1F00000000FFFF),
+    (16, 0x1F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
+
+
+def morton_order(points: np.ndarray) -> np.ndarray:
+    """Indices [points] that sort points [points, 3], finite numbers, along a Z-shaped curve through their box."""
+    points = points.astype(np.float64)
+    low, high = points.min(axis=0, initial=np.inf), points.max(axis=0, initial=-np.inf)
+    cells = (points - low) * ((2**BITS - 1) / np.maximum(high - low, np.finfo(np.float32).tiny))
+    code = np.zeros(len(points), np.uint64)
+    for axis, values in enumerate(cells.astype(np.uint64).T):
+        for shift, mask in SPREAD:
+            values = (values | values << np.uint64(shift)) & np.uint64(mask)
+        code |= values << np.uint64(axis)
+    return np.argsort(code, kind="stable")

@@ -1,0 +1,36 @@
+"""Unit quaternions, and their smallest three parts, from which compact formats rebuild the fourth."""
+
+import numpy as np
+
+# The three parts beside each largest one, in order.
+OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+SHORTEST = 1e-12  # below this a quaternion has no direction
+
+
+def unit_quaternions(quats: np.ndarray) -> np.ndarray:
+    """Quaternions wxyz [n, 4] of length 1, float32; zero, which says nothing, becomes no rotation."""
+    quats = np.asarray(quats, np.float32)
+    largest = np.abs(quats).max(axis=1, keepdims=True)  # first to about 1: the square of a float32 may overflow
+    quats = quats / np.where(largest > SHORTEST, largest, 1)
+    unit = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), SHORTEST)
+    unit[largest[:, 0] <= SHORTEST] = 1, 0, 0, 0
+    return unit
+
+
+def smallest_three(unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which part of each unit quaternion [n, 4] is the largest, [n], and the others [n, 3] with that one positive.
+
+    The others lie within sqrt(1/2). The order of the parts is the caller's; the same goes in and out.
+    """
+    largest = np.abs(unit).argmax(axis=1)
+    sign = np.where(np.take_along_axis(unit, largest[:, None], axis=1) < 0, -1, 1)
+    return largest, sign * np.take_along_axis(unit, OTHERS[largest], axis=1)
+
+
+def from_smallest_three(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """The unit quaternions [n, 4], float32, whose `smallest_three` these are."""
+    quats = np.empty((len(largest), 4), np.float32)
+    np.put_along_axis(quats, OTHERS[largest], others, axis=1)
+    rest = np.sqrt(np.maximum(1 - np.square(others).sum(axis=1), 0))
+    np.put_along_axis(quats, largest[:, None], rest[:, None], axis=1)
+    return quats
