@@ -155,7 +155,7 @@ class Run:
             loss, entry = scene_loss(self.state.model, next(scenes), phase, self.objective, self.perceptual)
             (loss / batch).backward()
             entries.append(entry)
-        norm = self.state.update(rate_at(self.state.step, self.settings.steps))
+        norm = self.state.update(rate_at(self.phases, self.state.step, self.settings.steps))
         means = {name: finite(sum(entry[name] for entry in entries) / batch) for name in entries[0]}
         seconds = round(time.monotonic() - started, 3)
         return {"step": self.state.step, **means, "gradient": finite(norm), "seconds": seconds}
