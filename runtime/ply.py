@@ -93,17 +93,20 @@ def _reserve(file: BinaryIO, size: int) -> None:
 def _encode(gaussians: Gaussians, block: slice, rows: np.ndarray) -> None:
     """Fill rows of the file with a block of the Gaussians: `_columns` in order, the normals after the means left alone.
 
-    Array by array, not column by column, which takes twice as long.
+    What has three or four parts goes column by column, since NumPy is slow where its innermost loop is so short.
     """
     sh = gaussians.sh[block]
-    count, rest = len(sh), sh.shape[1] - 1
+    rest = sh.shape[1] - 1
     opacities = np.clip(gaussians.opacities[block], MIN_OPACITY, 1 - MIN_OPACITY)
-    rows[:, 0:3] = gaussians.means[block]
-    rows[:, 6:9] = sh[:, 0]
-    rows[:, 9:-8].reshape(count, 3, rest)[...] = sh[:, 1:].transpose(0, 2, 1)
+    log_scales = np.log(np.maximum(gaussians.scales[block], MIN_SCALE))
+    for axis in range(3):
+        rows[:, axis] = gaussians.means[block, axis]
+        rows[:, 6 + axis] = sh[:, 0, axis]
+        rows[:, 9 + axis * rest : 9 + (axis + 1) * rest] = sh[:, 1:, axis]
+        rows[:, axis - 7] = log_scales[:, axis]
     rows[:, -8] = np.log(opacities / (1 - opacities))
-    rows[:, -7:-4] = np.log(np.maximum(gaussians.scales[block], MIN_SCALE))
-    rows[:, -4:] = gaussians.quats[block]
+    for part in range(4):
+        rows[:, part - 4] = gaussians.quats[block, part]
 
 
 class _Vertices(NamedTuple):
@@ -125,23 +128,47 @@ def _read_vertices(file: BinaryIO, path: Path, vertices: _Vertices) -> Gaussians
         opacities=np.empty(count, np.float32),
         sh=np.empty((count, vertices.sh_coefficients, 3), np.float32),
     )
-    columns = _columns(gaussians)
     file.seek(vertices.offset)
-    with np.errstate(over="ignore"):  # to infinity, which is refused below, or to an opacity of 0, which is meant
+    # To infinity or NaN, which are refused below, or to an opacity of 0, which is meant.
+    with np.errstate(over="ignore", invalid="ignore"):
         for block in _blocks(count):
             rows = np.frombuffer(file.read((block.stop - block.start) * vertices.row.itemsize), vertices.row)
-            for name, column in columns.items():
-                column[block] = rows[name]
-            gaussians.scales[block] = np.exp(gaussians.scales[block])
-            gaussians.opacities[block] = 1 / (1 + np.exp(-gaussians.opacities[block]))
+            _decode(rows, gaussians, block)
             _check_finite(gaussians, block, path)
     return gaussians
+
+
+def _decode(rows: np.ndarray, gaussians: Gaussians, block: slice) -> None:
+    """Fill a block of the Gaussians from structured rows of a file, whatever the order of its columns."""
+    table, place = _float_table(rows, list(_columns(gaussians)))
+    sh, scales, opacities = gaussians.sh[block], gaussians.scales[block], gaussians.opacities[block]
+    coefficients = sh.shape[1]
+    for axis, name in enumerate("xyz"):
+        gaussians.means[block, axis] = table[:, place[name]]
+        scales[:, axis] = table[:, place[f"scale_{axis}"]]
+    np.exp(scales, out=scales)
+    opacities[:] = 1 / (1 + np.exp(-table[:, place["opacity"]]))
+    for part in range(4):
+        gaussians.quats[block, part] = table[:, place[f"rot_{part}"]]
+    names = [f"f_dc_{channel}" for channel in range(3)]
+    names += [f"f_rest_{channel * (coefficients - 1) + k}" for k in range(coefficients - 1) for channel in range(3)]
+    # All at once and already in their places ("clip" lets it write there directly).
+    np.take(table, [place[name] for name in names], axis=1, out=sh.reshape(len(rows), len(names)), mode="clip")
+
+
+def _float_table(rows: np.ndarray, names: list[str]) -> tuple[np.ndarray, dict[str, int]]:
+    """Rows as float32 [rows, columns], with the columns of these names in the places given; usually a mere view."""
+    own = rows.dtype.names or ()
+    if all(rows.dtype[name] == np.float32 for name in own):
+        return rows.view(np.float32).reshape(len(rows), len(own)), {name: index for index, name in enumerate(own)}
+    table = np.stack([rows[name].astype(np.float32) for name in names], axis=1)
+    return table, {name: index for index, name in enumerate(names)}
 
 
 def _check_finite(gaussians: Gaussians, block: slice, path: Path) -> None:
     """Raise InputError for the first value of a block of decoded Gaussians that is not finite."""
     arrays = (gaussians.means, gaussians.scales, gaussians.quats, gaussians.opacities, gaussians.sh)
-    if all(np.isfinite(array[block]).all() for array in arrays):
+    if all(np.isfinite(array[block].sum()) for array in arrays):  # no sum of others is finite, and it is quicker
         return
     for name, column in _columns(gaussians).items():
         for vertex in np.flatnonzero(~np.isfinite(column[block])):
