@@ -1,15 +1,21 @@
 """Near and far: from what the cameras are known to see, from points matched between the views, or from the baseline."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
+import cv2
 import numpy as np
 
-from .cameras import Camera, invert_rigid
+from .cameras import Camera, invert_rigid, located, resized
 from .errors import InputError
+from .images import load_image, undistort
 from .matching import Features, epipolar_error, find_features, match_features, parallax, rays_of, triangulate
-from .sparse_depth import range_of_depths
+from .sparse_depth import FEWEST_POINTS, range_of_depths
+from .view_choice import compare, guess_distances
 
+# Pictures looked at to find how far away a scene is, each with two others, and their longer side in pixels.
+SAMPLES, SAMPLE_SIDE = 3, 640
 EPIPOLAR_ERROR = 1.5  # pixels
 SMALLEST_PARALLAX_DEG = 0.3  # below, a triangulated depth is noise
 
@@ -111,3 +117,46 @@ def _from_baseline(extrinsics: np.ndarray, trained: tuple[float, float]) -> Dept
     positions = extrinsics[:, :3, 3]
     baseline = max(float(np.linalg.norm(positions[i] - positions[j])) for i, j in neighbours(extrinsics))
     return DepthRange(baseline, baseline * trained[1] / trained[0], "the baseline")
+
+
+def scene_distances(pairs: Sequence[tuple[Path | np.ndarray, Camera]]) -> tuple[np.ndarray, str]:
+    """How far from each picture's camera the scene is, [pictures], and how that is known, in words.
+
+    In the middle of the depths that the camera is known to see; where that is not known, at the median depth of points
+    matched between a few of the pictures; where none match, as `guess_distances` has it.
+    Raises InputError if a picture cannot be read or does not fit its camera.
+    """
+    cameras = [camera for _, camera in pairs]
+    distances = guess_distances(cameras)
+    unknown = np.array([camera.depth_range is None for camera in cameras])
+    if not unknown.any():
+        return distances, "what the cameras are known to see"
+    depths = np.concatenate([np.zeros(0), *_sampled_depths(pairs, compare(cameras, distances).cost)])
+    if len(depths) < 2 * FEWEST_POINTS:
+        return distances, "the directions of the cameras"
+    return np.where(unknown, np.median(depths), distances), "points matched between a few photographs"
+
+
+def _sampled_depths(pairs: Sequence[tuple[Path | np.ndarray, Camera]], cost: np.ndarray) -> list[np.ndarray]:
+    """Depths of points that a few pictures share with the best partner by `cost` [pictures, pictures], and the next."""
+    samples = np.linspace(0, len(pairs) - 1, SAMPLES + 2)[1:-1].round().astype(int).tolist()
+    partners = [(i, j) for i in samples for j in (int(cost[i].argmin()), min(i + 1, len(pairs) - 1)) if i != j]
+    known = {index: _sample(*pairs[index]) for pair in partners for index in pair}
+    depths: list[np.ndarray] = []
+    for i, j in partners:
+        (first, first_camera), (second, second_camera) = known[i], known[j]
+        between = invert_rigid(second_camera.extrinsics) @ first_camera.extrinsics
+        depths += depths_of_pair(first, second, first_camera.K, second_camera.K, between)
+    return depths
+
+
+def _sample(picture: Path | np.ndarray, camera: Camera) -> tuple[Features, Camera]:
+    """Features of a picture, undistorted and made small, and its camera."""
+    image = picture if isinstance(picture, np.ndarray) else load_image(picture)
+    with located(camera.name):
+        camera = resized(camera, image.shape[1], image.shape[0])
+    factor = min(1, SAMPLE_SIDE / max(image.shape[:2]))
+    width, height = max(1, round(camera.width * factor)), max(1, round(camera.height * factor))
+    image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    image, camera = undistort(image, resized(camera, width, height))
+    return find_features(image), camera

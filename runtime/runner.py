@@ -9,11 +9,13 @@ import numpy as np
 
 from .bundle import Description, StageFile, read_description, read_manifest
 from .cameras import Camera
+from .depth_range import DepthRange, find_depth_range
 from .errors import InputError
 from .gaussians import Gaussians
+from .scene_frame import SceneFrame
 from .session import CPU, open_session, provider_name, run_session
 from .sizes import size_fits, size_rule
-from .views import check_views, prepare
+from .views import Views, check_views, prepare
 
 FUSED = "model"
 
@@ -61,14 +63,25 @@ class Runner:
         """Predict depth and Gaussians from photographs of any size.
 
         images: files, or RGB [h, w, 3] in uint8. cameras: one for each image, as `read_cameras` gives them.
-        near, far: scene units; the model's own range where not given. size: height and width that the model works at.
+        near, far: scene units; as `depth_range` finds them where not given. size: height and width to work at.
         Raises InputError for anything that cannot be used.
         """
         if len(images) != len(cameras):
             raise InputError(f"{len(images)} images and {len(cameras)} cameras, expected one camera for each image")
         height, width = size or self.size_for(cameras)
         views = prepare(list(zip(images, cameras, strict=True)), None, height, width)
-        return self.predict_arrays(views.images, views.extrinsics, views.intrinsics, near, far)
+        found = self.depth_range(views, near, far)
+        return self.predict_arrays(views.images, views.extrinsics, views.intrinsics, found.near, found.far)
+
+    def depth_range(self, views: Views, near: float | None = None, far: float | None = None) -> DepthRange:
+        """Near and far for these views, and where they come from; what is given stays.
+
+        Raises InputError if near is not before far.
+        """
+        trained = self.description.near, self.description.far
+        return find_depth_range(
+            views.images, views.extrinsics, views.intrinsics, views.cameras, trained, near=near, far=far
+        )
 
     def predict_arrays(
         self,
@@ -81,22 +94,24 @@ class Runner:
         """Predict depth and Gaussians from arrays at a size that the model takes.
 
         images: RGB in [0, 1]. extrinsics: camera-to-world, OpenCV axes. intrinsics: normalised by width and height.
-        near, far: scene units; the model's own range where not given.
+        near, far: scene units; the model's own range where not given. The network itself works in a frame and unit of
+        its own (`SceneFrame`): a scene in any unit gives the same result, in that unit.
         Raises InputError for anything the model cannot take.
         """
         near = self.description.near if near is None else near
         far = self.description.far if far is None else far
         check_views(images, extrinsics, intrinsics, near, far)
         self.check_size(len(images), *np.shape(images)[2:])
-        count = len(images)
+        nearest, farthest = (np.full(len(images), depth, np.float64) for depth in (near, far))
+        frame = SceneFrame.of(np.asarray(extrinsics), nearest, self.description.near)
         values = {
             "images": np.ascontiguousarray(images, np.float32),
-            "extrinsics": np.ascontiguousarray(extrinsics, np.float32),
+            "extrinsics": frame.enter(extrinsics),
             "intrinsics": np.ascontiguousarray(intrinsics, np.float32),
-            "near": np.full(count, near, np.float32),
-            "far": np.full(count, far, np.float32),
+            "near": (nearest * frame.scale).astype(np.float32),
+            "far": (farthest * frame.scale).astype(np.float32),
         }
-        return self._run(values)
+        return self._run(values, frame)
 
     def size_for(self, cameras: Sequence[Camera]) -> tuple[int, int]:
         """The trained height and width, turned upright where most pictures are and the model leaves the choice."""
@@ -121,7 +136,7 @@ class Runner:
             rule = size_rule(own.size_multiple)
             raise InputError(f"{self.path}: cannot take images of {height}x{width}; {rule}")
 
-    def _run(self, values: dict[str, np.ndarray]) -> Prediction:
+    def _run(self, values: dict[str, np.ndarray], frame: SceneFrame) -> Prediction:
         seconds = {}
         for (stage, session), keep in zip(self._stages, self._keep, strict=True):
             started = time.perf_counter()
@@ -129,7 +144,7 @@ class Runner:
             seconds[stage.name] = time.perf_counter() - started
             values = {name: value for name, value in values.items() if name in keep or len(self._stages) == 1}
         gaussians = Gaussians(*(values[name] for name in ("means", "scales", "quats", "opacities", "sh")))
-        return Prediction(values["depth"], gaussians, seconds)
+        return Prediction(frame.leave_depth(values["depth"]), frame.leave(gaussians), seconds)
 
 
 def _last_uses(stages: list[StageFile]) -> list[set[str]]:

@@ -9,24 +9,18 @@ from typing import Any
 import numpy as np
 
 from .cameras import Camera, check_intrinsics, located, resized, rigid
+from .depth_range import neighbours, scene_distances
 from .errors import InputError
 from .images import fit, load_image, stem, undistort
+from .view_choice import FEWEST_VIEWS, choose_views, compare
 
-FEWEST_VIEWS = 2
+Pair = tuple[Path | np.ndarray, Camera]  # a picture, as a file or as uint8 RGB [height, width, 3], and its camera
+
 EXAMPLES = 3  # names listed in a message
-
-# The parallax of a good pair, seen from what both look at: wide enough to measure depth, narrow enough to match.
-GOOD_PARALLAX_DEG = 5.0
-# Viewing directions this far apart cost as much as a baseline twice too long or too short.
-TURN_DEG = 30.0
-# The share of the cameras' movement that a common point of view must explain to be believed.
-FOCUS_EXPLAINS = 0.5
-# The scene's distance where the cameras have no common point of view, in longest baselines.
-UNKNOWN_DISTANCE = 3.0
 
 SAME_PLACE = 1e-4  # of the longest baseline
 SAME_ROTATION = 1e-4  # largest difference of two rotation matrices
-FLOAT32_ROUNDING = 4 * float(np.finfo(np.float32).eps)  # of the distance from the origin
+ROUNDINGS = 4  # of the distance from the origin, in steps of the poses' own type
 RANGE_SLACK = 1e-3  # how far resampling may have carried a pixel outside [0, 1]
 
 
@@ -36,9 +30,10 @@ class Views:
 
     names: file names of the pictures, [views].
     images: float32 RGB in [0, 1], [views, 3, height, width].
-    extrinsics: float32, camera-to-world, OpenCV axes, in the world frame and unit that the user gave, [views, 4, 4].
+    extrinsics: float64, camera-to-world, OpenCV axes, in the world frame and unit that the user gave, [views, 4, 4].
     intrinsics: float32, row 0 divided by the width and row 1 by the height, [views, 3, 3].
     cameras: the same cameras undistorted, at the full size of the pictures, [views].
+    choice: how these views were chosen of more, in words; empty where there was no choice.
     """
 
     names: list[str]
@@ -46,6 +41,7 @@ class Views:
     extrinsics: np.ndarray
     intrinsics: np.ndarray
     cameras: list[Camera]
+    choice: str = ""
 
 
 def match(images: Sequence[Path], cameras: Sequence[Camera]) -> list[tuple[Path, Camera]]:
@@ -80,33 +76,7 @@ def match(images: Sequence[Path], cameras: Sequence[Camera]) -> list[tuple[Path,
     return pairs
 
 
-def choose_views(extrinsics: np.ndarray, count: int) -> list[int]:
-    """Choose `count` cameras [cameras, 4, 4] that see a common region with good baselines; indices in rising order.
-
-    A pair is good when its parallax, seen from the scene, is near 5 degrees, and its viewing directions agree. The
-    best pair comes first; then, again and again, the camera that makes the best pair with its nearest chosen one.
-    The scene's distance is not known, so it is where the optical axes come closest to each other, or, where the
-    cameras do not look at a common place, three times the longest baseline. Ties go to the lower index.
-    Raises InputError if there are fewer cameras than asked for, or all stand at one place.
-    """
-    total = len(extrinsics)
-    if not FEWEST_VIEWS <= count <= total:
-        raise InputError(f"{count} views asked for, expected {FEWEST_VIEWS} to {total}, the number of images")
-    if count == total:
-        return list(range(total))
-    baselines = _baselines(extrinsics)  # [cameras, cameras]
-    cost = _pair_costs(extrinsics, baselines)  # [cameras, cameras]
-    if not np.isfinite(cost).any():
-        raise InputError("all cameras stand at one place, expected a baseline between them; depth needs one")
-    chosen = [int(index) for index in np.unravel_index(cost.argmin(), cost.shape)]
-    while len(chosen) < count:
-        rest = np.setdiff1d(np.arange(total), chosen)
-        nearest = np.array(chosen)[baselines[rest][:, chosen].argmin(axis=1)]  # [rest]
-        chosen.append(int(rest[cost[rest, nearest].argmin()]))
-    return sorted(chosen)
-
-
-def prepare(pairs: Sequence[tuple[Path | np.ndarray, Camera]], count: int | None, height: int, width: int) -> Views:
+def prepare(pairs: Sequence[Pair], count: int | None, height: int, width: int) -> Views:
     """Take the pictures (only `count` well chosen ones, if given), undistort them and bring them to height x width.
 
     A picture is a file, or RGB [h, w, 3] in uint8, and is known by its camera's name.
@@ -116,9 +86,9 @@ def prepare(pairs: Sequence[tuple[Path | np.ndarray, Camera]], count: int | None
     """
     if len(pairs) < FEWEST_VIEWS:
         raise InputError(f"{len(pairs)} image with a camera, expected at least {FEWEST_VIEWS}; add images")
-    if count is not None:
-        chosen = choose_views(np.stack([camera.extrinsics for _, camera in pairs]), count)
-        pairs = [pairs[index] for index in chosen]
+    choice = ""
+    if count is not None and count != len(pairs):
+        pairs, choice = choose_pairs(pairs, count)
     extrinsics = np.stack([camera.extrinsics for _, camera in pairs])  # [views, 4, 4]
     _check_distinct(extrinsics, [camera.name for _, camera in pairs])
     cameras, images, intrinsics = [], [], []
@@ -132,7 +102,27 @@ def prepare(pairs: Sequence[tuple[Path | np.ndarray, Camera]], count: int | None
         images.append(pixels)
         intrinsics.append(normalised)
     names = [_path(camera.name).name for _, camera in pairs]
-    return Views(names, np.stack(images), extrinsics.astype(np.float32), np.stack(intrinsics), cameras)
+    return Views(names, np.stack(images), extrinsics, np.stack(intrinsics), cameras, choice)
+
+
+def choose_pairs(pairs: Sequence[Pair], count: int) -> tuple[list[Pair], str]:
+    """The `count` best of these pictures with cameras, and why, in words.
+
+    How far the scene is decides what is a good baseline: cameras may know, and otherwise a few pictures are matched.
+    Raises InputError as `choose_views` does, or where a picture cannot be read.
+    """
+    cameras = [camera for _, camera in pairs]
+    distances, source = scene_distances(pairs)
+    chosen = choose_views(cameras, count, distances)
+    between = compare([cameras[index] for index in chosen], distances[chosen])
+    i, j = np.array(neighbours(np.stack([cameras[index].extrinsics for index in chosen]))).T
+    overlap, parallax = between.overlap[i, j], between.parallax[i, j]
+    angles = f"{parallax.min():.1f}" if len(i) == 1 else f"{parallax.min():.1f} to {parallax.max():.1f}"
+    choice = (
+        f"neighbours share at least {100 * overlap.min():.0f} % of their view, {angles} degrees apart as seen from the "
+        f"scene, which is {np.median(distances[chosen]):.3g} away by {source}"
+    )
+    return [pairs[index] for index in chosen], choice
 
 
 def check_views(images: Any, extrinsics: Any, intrinsics: Any, near: Any, far: Any) -> None:
@@ -199,31 +189,10 @@ def _baselines(extrinsics: np.ndarray) -> np.ndarray:
     return np.linalg.norm(positions[:, None] - positions[None], axis=-1)
 
 
-def _pair_costs(extrinsics: np.ndarray, baselines: np.ndarray) -> np.ndarray:
-    """How far each pair is from a good one, [cameras, cameras]; infinite without a baseline."""
-    forward = extrinsics[:, :3, 2]
-    parallax = np.degrees(2 * np.arctan2(baselines, 2 * _scene_distance(extrinsics, baselines)))
-    turn = np.degrees(np.arccos(np.clip(forward @ forward.T, -1, 1)))
-    with np.errstate(divide="ignore"):
-        cost = np.abs(np.log2(parallax / GOOD_PARALLAX_DEG)) + (turn / TURN_DEG) ** 2
-    return np.round(cost, 6)  # equally good pairs are equal whatever the rounding of their poses
-
-
-def _scene_distance(extrinsics: np.ndarray, baselines: np.ndarray) -> float:
-    """Distance at which points on the optical axes come closest to each other, by least squares."""
-    positions = extrinsics[:, :3, 3] - extrinsics[:, :3, 3].mean(axis=0)
-    forward = extrinsics[:, :3, 2] - extrinsics[:, :3, 2].mean(axis=0)
-    # |positions + distance * forward|^2 is least at distance = -joint / (forward * forward), having lost this share:
-    joint, movement, turning = (positions * forward).sum(), (positions**2).sum(), (forward**2).sum()
-    if joint < 0 and joint**2 > FOCUS_EXPLAINS * movement * turning:
-        return float(-joint / turning)
-    return UNKNOWN_DISTANCE * float(baselines.max())
-
-
 def _check_distinct(extrinsics: np.ndarray, names: Sequence[str]) -> None:
     """Refuse cameras without any baseline, and two cameras at one pose."""
     baselines = _baselines(extrinsics)
-    rounding = FLOAT32_ROUNDING * float(np.abs(extrinsics[:, :3, 3]).max())
+    rounding = ROUNDINGS * float(np.finfo(extrinsics.dtype).eps * np.abs(extrinsics[:, :3, 3]).max())
     if baselines.max() <= rounding:
         raise InputError(
             f"{names[0]} and {names[1]} stand at the same place, as do all cameras; depth needs a baseline"

@@ -44,6 +44,24 @@ def test_near_and_far_bound_the_depth(runner, arrays):
     assert depth.max() <= 5 * (1 + 1e-5)
 
 
+@pytest.mark.parametrize(("unit", "position"), ((1e3, (0, 0, 0)), (1e-3, (0, 0, 0)), (1.0, (4e5, 5e6, 300))))
+def test_a_scene_in_any_unit_and_place_gives_the_same(runner, arrays, unit, position):
+    """In millimetres, or where a surveyor's coordinates have it: the result is the same, in the user's own world."""
+    expected = runner.predict_arrays(**arrays, near=0.8, far=40)
+    poses = arrays["extrinsics"].astype(np.float64)
+    poses[:, :3, 3] = poses[:, :3, 3] * unit + position
+    moved = runner.predict_arrays(arrays["images"], poses, arrays["intrinsics"], near=0.8 * unit, far=40 * unit)
+    # Rounding may carry a projection over a pixel's edge, where nearest-neighbour warping picks another feature.
+    close = np.abs(moved.depth / unit - expected.depth) < 1e-4 * expected.depth
+    assert close.mean() > 0.999
+    means = (moved.gaussians.means - np.array(position)) / unit
+    rounding = 2e-4 + 4 * np.finfo(np.float32).eps * np.abs(position).max()
+    assert (np.abs(means - expected.gaussians.means).max(axis=1) < rounding * expected.depth.max()).mean() > 0.999
+    scales = np.abs(moved.gaussians.scales / unit - expected.gaussians.scales) < 1e-3 * expected.gaussians.scales
+    assert scales.mean() > 0.995
+    np.testing.assert_allclose(moved.gaussians.quats, expected.gaussians.quats, atol=1e-2)
+
+
 def spoil(name, index, value):
     def change(arrays):
         arrays[name][index] = value

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from idesplat.runtime.cameras import Camera
 from idesplat.runtime.errors import InputError
-from idesplat.runtime.views import check_views, choose_views, match, prepare
+from idesplat.runtime.view_choice import choose_views, compare
+from idesplat.runtime.views import check_views, match, prepare
 
 K = np.array([[70.0, 0, 42], [0, 72, 29], [0, 0, 1]])
 
@@ -32,6 +33,11 @@ def orbit(angles_deg, radius=4.0, centre=(10.0, -3.0, 5.0)):
         pose[:3, 3] = np.array(centre) - radius * forward
         poses.append(pose)
     return np.stack(poses)
+
+
+def at(poses):
+    """A camera at each pose."""
+    return [camera(str(index), extrinsics=pose) for index, pose in enumerate(poses)]
 
 
 def names(pairs):
@@ -74,13 +80,39 @@ def test_match_mistakes(images, cameras, expected):
 
 def test_choose_takes_five_degrees_on_an_orbit():
     poses = orbit([0, 1, 40, 45.2, 90, 180, 181])
-    assert choose_views(poses, 2) == [2, 3]
+    assert choose_views(at(poses), 2) == [2, 3]
 
 
 def test_choose_spreads_over_a_dense_video():
     poses = orbit(np.arange(0, 90, 1.0))
-    chosen = choose_views(poses, 4)
-    assert np.diff(chosen).tolist() == [5, 5, 5]
+    chosen = choose_views(at(poses), 4)
+    assert set(np.diff(chosen).tolist()) <= {5, 6}
+
+
+def test_choose_prefers_a_step_aside_to_a_step_forward():
+    poses = np.stack([np.eye(4)] * 4)
+    poses[:, :3, 3] = [(0, 0, 0), (0, 0, 0.4), (0.3, 0, 0), (0, 0, 0.8)]
+    cameras = [replace(camera, depth_range=(1.0, 16.0)) for camera in at(poses)]
+    assert choose_views(cameras, 2) == [0, 2]
+
+
+def test_what_cameras_are_known_to_see_decides_the_baseline():
+    poses = np.stack([np.eye(4)] * 4)
+    poses[:, 0, 3] = (0, 0.1, 1, 10)
+    for distance in (1, 10, 100):
+        cameras = [replace(camera, depth_range=(0.5 * distance, 2.0 * distance)) for camera in at(poses)]
+        first, second = choose_views(cameras, 2)
+        assert 0.08 < (poses[second, 0, 3] - poses[first, 0, 3]) / distance < 0.11
+
+
+def test_compare_knows_overlap_and_parallax():
+    poses = np.stack([np.eye(4)] * 3)
+    poses[1, 0, 3] = 40 / 70  # half of the picture at a distance of 1, where 70 pixels are one unit
+    poses[2, :3, :3] = np.diag([-1, 1, -1])  # looks back
+    pairs = compare(at(poses), np.ones(3))
+    assert pairs.overlap[0, 1] == pairs.overlap[1, 0] == pytest.approx(0.5)
+    assert 20 < pairs.parallax[0, 1] < np.degrees(2 * np.arctan(20 / 70))
+    assert pairs.overlap[0, 2] == pairs.parallax[0, 2] == 0 and np.isinf(pairs.cost[0, 2])
 
 
 def test_choose_does_not_depend_on_frame_or_unit():
@@ -90,32 +122,32 @@ def test_choose_does_not_depend_on_frame_or_unit():
     moved = turned @ poses
     moved[:, :3, 3] = 50 * moved[:, :3, 3] + (3, -8, 1)
     for count in range(2, 6):
-        assert choose_views(moved, count) == choose_views(poses, count)
+        assert choose_views(at(moved), count) == choose_views(at(poses), count)
 
 
 def test_choose_avoids_cameras_that_look_elsewhere():
     # Parallel cameras on a line; the second has the better baseline but is turned away from what the others see.
     poses = np.stack([np.eye(4)] * 4)
     poses[:, 0, 3] = (0, 0.26, 0.3, 1)
-    assert choose_views(poses, 2) == [0, 1]
+    assert choose_views(at(poses), 2) == [0, 1]
     poses[1, :3, :3] = cv2.Rodrigues(np.array([0, 2.5, 0]))[0]
-    assert choose_views(poses, 2) == [0, 2]
+    assert choose_views(at(poses), 2) == [0, 2]
 
 
 def test_choose_does_not_repeat_a_place():
     poses = orbit([0, 5, 5, 0, 10])
-    assert choose_views(poses, 3) == [0, 1, 4]
-    assert choose_views(poses, 5) == [0, 1, 2, 3, 4]
-    assert len(set(choose_views(poses, 4))) == 4
+    assert choose_views(at(poses), 3) == [0, 1, 4]
+    assert choose_views(at(poses), 5) == [0, 1, 2, 3, 4]
+    assert len(set(choose_views(at(poses), 4))) == 4
 
 
 def test_choose_mistakes():
     with pytest.raises(InputError, match="3 views asked for, expected 2 to 2"):
-        choose_views(orbit([0, 5]), 3)
+        choose_views(at(orbit([0, 5])), 3)
     with pytest.raises(InputError, match="1 views asked for"):
-        choose_views(orbit([0, 5]), 1)
-    with pytest.raises(InputError, match="stand at one place"):
-        choose_views(np.stack([np.eye(4)] * 3), 2)
+        choose_views(at(orbit([0, 5])), 1)
+    with pytest.raises(InputError, match="no two cameras see the same from different places"):
+        choose_views(at([np.eye(4)] * 3), 2)
 
 
 @given(
@@ -128,7 +160,7 @@ def test_choose_gives_distinct_rising_indices_or_an_input_error(values, count):
     for pose, value in zip(poses, values, strict=True):
         pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(np.array(value[:3]))[0], value[3:]
     try:
-        chosen = choose_views(poses, count)
+        chosen = choose_views(at(poses), count)
     except InputError:
         return
     assert len(chosen) == count and chosen == sorted(set(chosen)) and chosen[0] >= 0 and chosen[-1] < len(values)
@@ -162,14 +194,18 @@ def test_prepare_gives_what_the_network_takes(pairs):
     scale_x, scale_y = 43 / 80, 32 / 60
     expected = [[70 * scale_x / 32, 0, (42 * scale_x - 5) / 32], [0, 72 * scale_y / 32, 29 * scale_y / 32], [0, 0, 1]]
     np.testing.assert_allclose(views.intrinsics, [expected] * 3, rtol=1e-6)
-    assert {array.dtype for array in (views.images, views.extrinsics, views.intrinsics)} == {np.dtype(np.float32)}
+    assert [array.dtype for array in (views.images, views.intrinsics, views.extrinsics)] == ["f4", "f4", "f8"]
+    assert views.choice == ""
     assert [camera.distortion for camera in views.cameras] == [None] * 3
     check_views(views.images, views.extrinsics, views.intrinsics, 0.5, 100)
 
 
-def test_prepare_reads_only_the_chosen(pairs):
+def test_prepare_reads_only_the_chosen_where_depths_are_known(pairs):
     pairs[2][0].unlink()
-    assert prepare(pairs, 2, 32, 32).names == ["0.png", "1.png"]
+    pairs = [(path, replace(camera, depth_range=(2.0, 8.0))) for path, camera in pairs]
+    views = prepare(pairs, 2, 32, 32)
+    assert views.names == ["0.png", "1.png"]
+    assert "degrees apart" in views.choice and "4 away by what the cameras are known to see" in views.choice
 
 
 def test_prepare_scales_cameras_of_larger_pictures(pairs):
