@@ -46,9 +46,9 @@ def ssim(picture: np.ndarray, truth: np.ndarray, valid: np.ndarray) -> float:
     similarity = (2 * mean_x * mean_y + SSIM_C1) * (2 * covariance + SSIM_C2)
     similarity /= (mean_x**2 + mean_y**2 + SSIM_C1) * (variance_x + variance_y + SSIM_C2)
 
-    whole = np.pad(valid, 1).astype(np.uint8)  # outside of the image nothing is valid
-    whole = cv2.erode(whole, np.ones((SSIM_WINDOW, SSIM_WINDOW), np.uint8), borderType=cv2.BORDER_REPLICATE)
-    whole = whole[1:-1, 1:-1].astype(bool)
+    padded = np.pad(valid, 1).astype(np.uint8)  # outside of the image nothing is valid
+    window = np.ones((SSIM_WINDOW, SSIM_WINDOW), np.uint8)
+    whole = cv2.erode(padded, window, borderType=cv2.BORDER_REPLICATE)[1:-1, 1:-1].astype(bool)
     return float(similarity[whole].mean()) if whole.any() else float("nan")
 
 

@@ -1,0 +1,216 @@
+"""The command idesplat-eval: how well an exported model draws views that it was not given, in the field's measures."""
+
+import sys
+from collections.abc import Callable, Iterable
+from dataclasses import asdict
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ..runtime.default_model import default_model
+from ..runtime.errors import InputError, exit_on_input_error
+from ..runtime.files import check_writable, make_folder
+from ..runtime.sizes import parse_size
+
+if TYPE_CHECKING:  # nothing heavy is loaded before there is something to evaluate
+    import numpy as np
+
+    from ..runtime.cameras import Camera
+    from ..runtime.runner import Runner
+    from .cases import Case
+    from .novel_views import Evaluator, Result
+
+# Scenes of which `chunks` and `procedural` leave pictures.
+PICTURED = 8
+# Of a procedural scene.
+TARGETS = 2
+HELD_OUT_SCENES = 200
+
+Skip = Callable[[str, str], None]
+Out = Annotated[Path, typer.Option(help="Folder for results.json and pictures.", show_default=False)]
+Model = Annotated[
+    Path | None, typer.Option(help="A .onnx or staged folder of idesplat-export instead of the carried model.")
+]
+Size = Annotated[str | None, typer.Option(help="HEIGHTxWIDTH to work at instead of the trained size.")]
+Near = Annotated[float | None, typer.Option(help="Nearest depth in scene units instead of the model's.")]
+Far = Annotated[float | None, typer.Option(help="Farthest depth in scene units instead of the model's.")]
+
+app = typer.Typer(add_completion=False, no_args_is_help=True, help=__doc__)
+
+
+@app.command()
+@exit_on_input_error
+def scene(
+    images: Annotated[Path, typer.Argument(help="Folder of photographs.", show_default=False)],
+    cameras: Annotated[Path, typer.Option(help="Their cameras, such as a transforms.json.", show_default=False)],
+    out: Out,
+    model: Model = None,
+    context: Annotated[list[str] | None, typer.Option(help="A photograph to infer from; give two or more.")] = None,
+    target: Annotated[list[str] | None, typer.Option(help="A photograph to hold out; give one or more.")] = None,
+    views: Annotated[int, typer.Option(help="Photographs around each target, without --context.", min=2)] = 2,
+    hold_out_every: Annotated[int, typer.Option(help="Hold out one of so many, without --target.", min=2)] = 8,
+    depth: Annotated[Path | None, typer.Option(help="Folder of true depth, as make_scene writes it.")] = None,
+    size: Size = None,
+    near: Near = None,
+    far: Far = None,
+) -> None:
+    """Hold photographs out, infer from others, and compare; beside the nearest photograph and the best plane."""
+    from ..runtime.cameras import read_cameras
+    from ..runtime.images import find_images
+    from ..runtime.views import match
+    from .metrics import load_lpips
+    from .novel_views import Evaluator, mean_of_views
+    from .report import print_means, print_views
+    from .scene_cases import chosen_frames, load_case
+
+    found = find_images([images])
+    frames = match(found, read_cameras(cameras, found))
+    runner = _runner(model, out)
+    chosen = chosen_frames(frames, context or [], target or [], runner.description.fixed_views or views, hold_out_every)
+    height, width = parse_size(size) if size else runner.size_for([camera for _, camera in frames])
+    for sources, held_out in chosen:
+        runner.check_size(len(sources), height, width)
+        print(f"held out {_names(frames, held_out)}, inferred from {_names(frames, sources)}")
+    cases = (load_case(frames, *numbers, height, width, depth) for numbers in chosen)
+    evaluator = Evaluator(runner, load_lpips(), near=near, far=far)
+    results = _evaluate(cases, len(chosen), evaluator, out, pictured=len(chosen))
+    means = mean_of_views(results)
+    print_views(results)
+    print_means(means, f"{sum(len(result.targets) for result in results)} views held out, {height}x{width}")
+    about = {"command": "scene", "images": str(images), "height": height, "width": width, "near": near, "far": far}
+    _write(out, about, runner, means, results)
+
+
+@app.command()
+@exit_on_input_error
+def chunks(
+    folder: Annotated[Path, typer.Argument(help="Folder of .torch chunks.", show_default=False)],
+    index: Annotated[Path, typer.Option(help="The published evaluation index (.json).", show_default=False)],
+    out: Out,
+    model: Model = None,
+    near: Near = None,
+    far: Far = None,
+) -> None:
+    """Evaluate on RealEstate10K, ACID or DL3DV as the papers do: pixelSplat's chunks, a published index of frames."""
+    from .chunks import NEAREST_DRAWN, chunk_cases, find_chunks, read_index
+    from .metrics import load_lpips
+    from .novel_views import Evaluator, first_given, mean_of_scenes
+    from .report import print_means
+
+    entries, files = read_index(index), find_chunks(folder)
+    runner = _runner(model, out)
+    height, width = runner.description.height, runner.description.width
+    for views in sorted({len(entry.context) for entry in entries.values()}):
+        runner.check_size(views, height, width)
+    nearest_drawn = NEAREST_DRAWN * first_given(near, runner.description.near)
+    evaluator = Evaluator(runner, load_lpips(), False, near, far, nearest_drawn)
+    skipped: dict[str, str] = {}
+    cases = chunk_cases(files, entries, height, width, skipped.__setitem__)
+    results = _evaluate(cases, len(entries), evaluator, out, PICTURED, skipped.__setitem__)
+    for key, reason in skipped.items():
+        print(f"skipped {key}: {reason}")
+    missing = len(entries) - len(results) - len(skipped)
+    if not results:
+        raise InputError(
+            f"{index}: of its {len(entries)} scenes {missing} are not in {folder} and {len(skipped)} cannot be used; "
+            "give the chunks of the test set that the index was made for"
+        )
+    means = mean_of_scenes(results)
+    print_means(means, f"{len(results)} of the index's {len(entries)} scenes, {height}x{width}")
+    if missing:
+        print(f"{missing} of the index's scenes are not in {folder}")
+    about = {"command": "chunks", "index": str(index), "near": near, "far": far, "skipped": skipped, "missing": missing}
+    _write(out, about, runner, means, results)
+
+
+@app.command()
+@exit_on_input_error
+def procedural(
+    out: Out,
+    model: Model = None,
+    scenes: Annotated[
+        int, typer.Option(help="How many of the held-out scenes.", min=1, max=HELD_OUT_SCENES)
+    ] = HELD_OUT_SCENES,
+    views: Annotated[int, typer.Option(help="Context views of each scene.", min=2, max=8)] = 2,
+    size: Size = None,
+) -> None:
+    """Evaluate on the held-out procedural scenes: depth against the truth, and novel views (extra `eval`)."""
+    if find_spec("numba") is None:
+        raise InputError(
+            "numba is needed to draw procedural scenes, and is not installed; pip install 'idesplat[eval]'"
+        )
+    from .cases import procedural_case
+    from .metrics import load_lpips
+    from .novel_views import Evaluator, mean_of_scenes
+    from .report import print_means
+    from .scenes import HELD_OUT_SEEDS
+
+    runner = _runner(model, out)
+    height, width = parse_size(size) if size else (runner.description.height, runner.description.width)
+    runner.check_size(views, height, width)
+    cases = (procedural_case(seed, views, TARGETS, height, width) for seed in HELD_OUT_SEEDS[:scenes])
+    results = _evaluate(cases, scenes, Evaluator(runner, load_lpips()), out, PICTURED)
+    means = mean_of_scenes(results)
+    print_means(means, f"{scenes} held-out procedural scenes, {views} views, {height}x{width}")
+    about = {"command": "procedural", "views": views, "height": height, "width": width}
+    _write(out, about, runner, means, results)
+
+
+def main() -> None:
+    """Entry point of idesplat-eval."""
+    app()
+
+
+def _names(frames: "list[tuple[Path, Camera]]", numbers: list[int]) -> str:
+    return ", ".join(frames[number][0].name for number in numbers)
+
+
+def _runner(model: Path | None, out: Path) -> "Runner":
+    """The model, once it is known that results can be written."""
+    from ..runtime.runner import Runner
+
+    runner = Runner(model or default_model())
+    check_writable(make_folder(out))
+    return runner
+
+
+def _evaluate(
+    cases: "Iterable[Case]", total: int, evaluator: "Evaluator", out: Path, pictured: int, skip: Skip | None = None
+) -> "list[Result]":
+    """Evaluate cases, with a bar on stderr where that is a terminal, and write pictures of the first `pictured` ones.
+
+    skip: hears of a case that the model cannot take, and why; without it that is an error.
+    """
+    from rich.console import Console
+    from rich.progress import track
+
+    from ..runtime.images_out import save_png
+
+    results: list[Result] = []
+    for case in track(cases, "Evaluating", total, console=Console(stderr=True), disable=not sys.stderr.isatty()):
+
+        def show(target: str, strip: "np.ndarray", scene: str = case.name) -> None:
+            save_png(out / f"{scene}-{Path(target).stem}.png", strip)
+
+        try:
+            results.append(evaluator.evaluate(case, show if len(results) < pictured else None))
+        except InputError as error:
+            if skip is None:
+                raise
+            skip(case.name, str(error))
+    return results
+
+
+def _write(
+    out: Path, about: dict[str, Any], runner: "Runner", means: dict[str, dict[str, float]], results: "list[Result]"
+) -> None:
+    """Write results.json and say what there is to look at."""
+    from .report import write_results
+
+    path = write_results(
+        out, about | {"model": {"path": str(runner.path), **asdict(runner.description)}}, means, results
+    )
+    print(f"wrote {path}")
+    print(f"pictures (truth, render, error, depth, and the best plane where there is one) are beside it in {out}")

@@ -1,0 +1,161 @@
+"""One case through an exported model: its target views drawn, and measured beside what trivial methods make of them."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ..runtime.gaussians import Gaussians
+from ..runtime.images_out import depth_colours
+from ..runtime.rasterizer import Rendering, rasterize
+from ..runtime.render import world_to_camera
+from ..runtime.runner import Runner
+from .baselines import best_plane, nearest_view
+from .cases import Case, Posed
+from .metrics import LPIPS, depth_measures, psnr, ssim
+
+MODEL, NEAREST, PLANE = "model", "nearest", "plane"
+# World units from the camera at which Gaussians begin to be drawn, where nothing else is asked for.
+NEAREST_DRAWN = 0.01
+# A mean difference of the colours from here on has the brightest colour.
+WORST_ERROR = 0.3
+# Where less of the light is stopped, there is no depth to show.
+LEAST_ALPHA = 0.05
+GAP = 4  # white pixels between the pictures of a strip
+
+# Values by method and measure.
+Scores = dict[str, dict[str, float]]
+
+
+@dataclass(frozen=True)
+class Target:
+    """The measures of a target view, by method and measure.
+
+    details: what the trivial methods found, the nearest view's name and the plane's depth in scene units.
+    """
+
+    name: str
+    scores: Scores
+    details: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Result:
+    """What was measured of a case; depth: AbsRel and its like, where the context's depth is known."""
+
+    name: str
+    context: list[str]
+    targets: list[Target]
+    depth: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Evaluator:
+    """A model and how it is measured.
+
+    lpips: the measure, where it is there. trivial: whether the trivial methods are measured too.
+    near, far: scene units, for cases that have none of their own; None for the model's.
+    nearest_drawn: scene units from the camera at which Gaussians begin to be drawn.
+    """
+
+    runner: Runner
+    lpips: LPIPS | None
+    trivial: bool = True
+    near: float | None = None
+    far: float | None = None
+    nearest_drawn: float = NEAREST_DRAWN
+
+    def evaluate(self, case: Case, show: Callable[[str, np.ndarray], None] | None = None) -> Result:
+        """Predict from the context, draw the targets and measure them.
+
+        show: is given each target's name and strip: truth, render, error, depth and, if measured, the plane; RGB in
+        [0, 1], [height, all widths, 3]. Raises InputError for what the model cannot take.
+        """
+        near = first_given(case.near, self.near, self.runner.description.near)
+        far = first_given(case.far, self.far, self.runner.description.far)
+        context = case.context
+        prediction = self.runner.predict_arrays(context.images, context.extrinsics, context.intrinsics, near, far)
+        targets = []
+        for view, name in enumerate(case.targets.names):
+            truth, valid = case.targets.picture(view), case.targets.valid[view]
+            drawn = draw(prediction.gaussians, case.targets, view, self.nearest_drawn)
+            pictures: dict[str, np.ndarray] = {MODEL: drawn.rgb}
+            details: dict[str, Any] = {}
+            if self.trivial:
+                others, details = _trivial(case, view, near, far)
+                pictures |= others
+            scores = {method: self._measure(picture, truth, valid) for method, picture in pictures.items()}
+            targets.append(Target(name, scores, details))
+            if show is not None:
+                show(name, _strip(truth, valid, drawn, pictures.get(PLANE)))
+        depth = {} if case.depth is None else depth_measures(prediction.depth, case.depth)
+        return Result(case.name, context.names, targets, depth)
+
+    def _measure(self, picture: np.ndarray, truth: np.ndarray, valid: np.ndarray) -> dict[str, float]:
+        scores = {"psnr": psnr(picture, truth, valid), "ssim": ssim(picture, truth, valid)}
+        return scores if self.lpips is None else {**scores, "lpips": self.lpips(picture, truth, valid)}
+
+
+def first_given(*values: float | None) -> float:
+    """The first value that is not None."""
+    return next(value for value in values if value is not None)
+
+
+def mean_of_views(results: Sequence[Result]) -> Scores:
+    """The mean of every method's measures over all target views; those of depth, over the scenes, are the model's."""
+    means = _mean([target.scores for result in results for target in result.targets])
+    means[MODEL] |= _mean([{MODEL: result.depth} for result in results])[MODEL]
+    return means
+
+
+def mean_of_scenes(results: Sequence[Result]) -> Scores:
+    """As the papers count: the mean over the scenes of their means over the target views."""
+    return _mean([mean_of_views([result]) for result in results])
+
+
+def draw(gaussians: Gaussians, targets: Posed, view: int, nearest_drawn: float = NEAREST_DRAWN) -> Rendering:
+    """The Gaussians from a target camera at its picture's size, on black."""
+    height, width = targets.images.shape[2:]
+    return rasterize(
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales,
+        gaussians.opacities,
+        gaussians.sh,
+        world_to_camera(targets.extrinsics[view].astype(np.float64)),
+        targets.K(view),
+        width,
+        height,
+        near=nearest_drawn,
+    )
+
+
+def _mean(entries: list[Scores]) -> Scores:
+    """The mean of entries that all have the same methods and measures."""
+    return {
+        method: {measure: float(np.mean([entry[method][measure] for entry in entries])) for measure in measures}
+        for method, measures in entries[0].items()
+    }
+
+
+def _trivial(case: Case, view: int, near: float, far: float) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The trivial methods' pictures of a target, [height, width, 3], and what they found."""
+    context, targets, pose = case.context, case.targets, case.targets.extrinsics[view]
+    copied = nearest_view(context, pose)
+    plane, depth = best_plane(context, targets.picture(view), targets.valid[view], pose, targets.K(view), near, far)
+    pictures = {NEAREST: context.picture(copied), PLANE: plane}
+    return pictures, {"nearest_view": context.names[copied], "plane_depth": depth}
+
+
+def _strip(truth: np.ndarray, valid: np.ndarray, drawn: Rendering, plane: np.ndarray | None) -> np.ndarray:
+    """Truth, render, error (black where nothing is measured), depth and plane side by side."""
+    error = np.abs(drawn.rgb.clip(0, 1) - truth).mean(axis=2) * valid / WORST_ERROR
+    hot = cv2.applyColorMap(np.rint(255 * error.clip(0, 1)).astype(np.uint8), cv2.COLORMAP_INFERNO)
+    depth = np.where(drawn.alpha > LEAST_ALPHA, drawn.depth / np.maximum(drawn.alpha, LEAST_ALPHA), 0)
+    pictures = [truth, drawn.rgb, hot[..., ::-1].astype(np.float32) / 255, depth_colours(depth)]
+    if plane is not None:
+        pictures.append(plane)
+    white = np.ones((len(truth), GAP, 3), np.float32)
+    return np.concatenate([part for picture in pictures for part in (white, picture)][1:], axis=1)
