@@ -1,28 +1,93 @@
-"""How well each pixel matches its neighbours at each candidate depth, by bilinear warping (plane sweep)."""
+"""How well each pixel matches its neighbours at each candidate depth, by bilinear warping (plane sweep).
 
+Three forms of the same sums. PyTorch has an operator that samples features, which are then scored. In ONNX that operator,
+GridSample, is slow on CPUs and missing elsewhere. Interpolation and inner product commute, so a graph scores whole pixels
+first and interpolates between four scores.
+"""
+
+import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from .epipolar_attention import correlate, pixel_table
-from .geometry import Cameras, bilinear_pixels, scale_intrinsics
+from .epipolar_attention import correlate
+from .geometry import Cameras, sampling_points, scale_intrinsics
 from .layers import fixed, repeat_views, to_tokens
+
+# With more candidates than this, scoring all pixels is less work than gathering those around every candidate.
+FEW_CANDIDATES = 64
+# Parts in which a view's pixels are scored with all others, so that the scores stay within a processor's cache.
+PARTS = 16
 
 
 def cost_volume(features: Tensor, candidates: Tensor, cameras: Cameras, neighbours: Tensor) -> Tensor:
     """Correlation of features [views, channels, h, w] with those of the neighbours, warped: [views, candidates, h, w].
 
     candidates: inverse depths [views, candidates, h, w]. neighbours: [views, n]; their costs are averaged.
-    Interpolation and inner product commute, so each of the four pixels is correlated first and the four numbers are
-    interpolated, not the features. Each view projects with its own intrinsics; the release projects into a neighbour
-    with those of the view that looks, which are the same in all that it was trained on.
+    Each view projects with its own intrinsics; the release projects into a neighbour with those of the view that looks,
+    which are the same in all that it was trained on.
     """
     views, _, height, width = features.shape
-    channels = fixed(features.shape[1])
+    channels, count = fixed(features.shape[1]), fixed(candidates.shape[1])
     intrinsics = scale_intrinsics(cameras.intrinsics, height, width)
-    tokens = to_tokens(features)
-    queries = repeat_views(tokens * channels**-0.5, neighbours.shape[1])
-    table = pixel_table(tokens)
-    corners = bilinear_pixels(candidates, intrinsics, cameras.extrinsics, neighbours)
-    costs = [weights * correlate(queries, table, rows) for rows, weights in corners]  # each [pairs, candidates, h * w]
-    count = fixed(candidates.shape[1])
-    mean = sum(costs[1:], start=costs[0]).reshape(views, -1, count, height * width).mean(1)
-    return mean.reshape(-1, count, height, width)
+    x, y = sampling_points(candidates, intrinsics, cameras.extrinsics, neighbours)
+    if not torch.onnx.is_in_onnx_export():
+        form = by_sampling
+    else:
+        form = by_all_scores if count > FEW_CANDIDATES else by_gathering
+    scores = form(features, neighbours, x, y) * channels**-0.5
+    return scores.reshape(views, -1, count, height * width).mean(1).reshape(-1, count, height, width)
+
+
+def by_sampling(features: Tensor, neighbours: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Scores of every pixel with its neighbours' features at x and y, [pairs, candidates, h * w] like x and y."""
+    height, width = features.shape[2:]
+    grid = torch.stack([2 * x / (width - 1) - 1, 2 * y / (height - 1) - 1], dim=-1)
+    warped = F.grid_sample(features[neighbours].flatten(0, 1), grid, align_corners=True)
+    own = repeat_views(features.flatten(2), neighbours.shape[1])[:, :, None]  # [pairs, channels, 1, h * w]
+    return (warped * own).sum(1)
+
+
+def by_all_scores(features: Tensor, neighbours: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """The same by one matrix product: the scores with all pixels of the neighbours, of which those around are kept."""
+    pixels = features.shape[2] * features.shape[3]
+    own = repeat_views(to_tokens(features), neighbours.shape[1])  # [pairs, h * w, channels]
+    others = bordered(features).flatten(2)[neighbours].flatten(0, 1)  # [pairs, channels, bordered pixels]
+    corners, across, down = corners_around(x.transpose(1, 2), y.transpose(1, 2), *features.shape[2:])
+    parts = []
+    for part in range(PARTS):
+        some = slice(pixels * part // PARTS, pixels * (part + 1) // PARTS)
+        scores = own[:, some] @ others  # [pairs, some, bordered pixels]
+        around = [scores.gather(2, corner[:, some]) for corner in corners]
+        parts.append(interpolate(around, across[:, some], down[:, some]))
+    return torch.cat(parts, dim=1).transpose(1, 2)
+
+
+def by_gathering(features: Tensor, neighbours: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """The same by gathering the features of the four pixels around each candidate."""
+    own = repeat_views(to_tokens(features), neighbours.shape[1])  # [pairs, h * w, channels]
+    tokens = to_tokens(bordered(features))  # [views, bordered pixels, channels]
+    first = (neighbours.flatten() * tokens.shape[1])[:, None, None]
+    corners, across, down = corners_around(x, y, *features.shape[2:])
+    around = [correlate(own, tokens.flatten(0, 1), first + corner) for corner in corners]
+    return interpolate(around, across, down)
+
+
+def bordered(features: Tensor) -> Tensor:
+    """Maps [n, channels, h, w] with a border of zeros, which is what lies outside."""
+    return F.pad(features, (1, 1, 1, 1))
+
+
+def corners_around(x: Tensor, y: Tensor, height: int, width: int) -> tuple[list[Tensor], Tensor, Tensor]:
+    """The four pixels around x and y as indices of a bordered map, upper ones first, and the way from left and top."""
+    left, top = x.floor().clamp(max=width - 1), y.floor().clamp(max=height - 1)
+    row = width + 2
+    upper_left = ((top + 1) * row + left + 1).long()
+    return [upper_left, upper_left + 1, upper_left + row, upper_left + row + 1], x - left, y - top
+
+
+def interpolate(around: list[Tensor], across: Tensor, down: Tensor) -> Tensor:
+    """Bilinear interpolation between what `corners_around` orders."""
+    upper_left, upper_right, lower_left, lower_right = around
+    upper = upper_left + across * (upper_right - upper_left)
+    lower = lower_left + across * (lower_right - lower_left)
+    return upper + down * (lower - upper)

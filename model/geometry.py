@@ -119,28 +119,15 @@ def nearest_pixels(inverse_depth: Tensor, intrinsics: Tensor, extrinsics: Tensor
         return torch.where(valid, pixel + first[:, None, None], views * height * width)
 
 
-def bilinear_pixels(
+def sampling_points(
     inverse_depth: Tensor, intrinsics: Tensor, extrinsics: Tensor, neighbours: Tensor
-) -> list[tuple[Tensor, Tensor]]:
-    """The warp of DepthSplat: the four pixels around where each candidate falls, and their bilinear weights.
+) -> tuple[Tensor, Tensor]:
+    """Where DepthSplat's warp looks: x and y in pixels, each [views * n, candidates, h * w].
 
-    Arguments as for `project_candidates`. Returns four pairs of rows, as of `nearest_pixels`, and float weights, both
-    [views * n, candidates, h * w]. Of a projection on the border only the pixels inside count, as with zero padding.
+    Arguments as for `project_candidates`. What lies outside or behind the camera is brought to one pixel from the
+    map's border, where zero padding leaves nothing of it.
     """
-    views, _, height, width = inverse_depth.shape
+    _, _, height, width = inverse_depth.shape
     with torch.no_grad():
         x, y, front = project_candidates(inverse_depth, intrinsics, extrinsics, neighbours)
-        left, top = x.floor(), y.floor()
-        across, down = x - left, y - top
-        first = (neighbours.flatten() * (height * width)).to(torch.int32)[:, None, None]
-        columns = ((left, 1 - across), (left + 1, across))
-        rows = ((top, 1 - down), (top + 1, down))
-        corners = []
-        for row, row_weight in rows:
-            row_inside = front & (row >= 0) & (row <= height - 1)
-            for column, column_weight in columns:
-                inside = row_inside & (column >= 0) & (column <= width - 1)
-                pixel = (row * width + column).to(torch.int32) + first
-                weight = torch.where(inside, row_weight * column_weight, 0.0)
-                corners.append((torch.where(inside, pixel, views * height * width), weight))
-        return corners
+        return torch.where(front, x, -1.0).clamp(-1, width), torch.where(front, y, -1.0).clamp(-1, height)

@@ -19,8 +19,8 @@ from idesplat.model.config import (
     UpsamplerConfig,
     ViTConfig,
 )
-from idesplat.model.cost_volume import cost_volume
-from idesplat.model.geometry import Cameras, project_candidates, scale_intrinsics
+from idesplat.model.cost_volume import by_all_scores, by_gathering, by_sampling
+from idesplat.model.geometry import Cameras, project_candidates, sampling_points, scale_intrinsics
 from idesplat.model.layers import resize
 from idesplat.model.networks import build
 from reference_weights import draw_tensor
@@ -128,24 +128,24 @@ def test_depth_only_network_gives_the_same_depth():
         torch.testing.assert_close(alone(*inputs), whole(*inputs).depth)
 
 
-def test_cost_volume_is_grid_sample_then_correlation():
-    """The four gathers give what torch's own sampler gives, borders included, with cameras that turn away."""
+@pytest.mark.parametrize("form", (by_sampling, by_all_scores, by_gathering))
+def test_every_form_of_the_cost_volume_is_grid_sample_then_correlation(form):
+    """Borders included, with cameras that turn away and candidates that fall far outside."""
     count, channels, height, width = 4, 6, 9, 13
-    _, extrinsics, intrinsics, near, far = scene(count, height, width, seed=4)
+    _, extrinsics, intrinsics, _, _ = scene(count, height, width, seed=4)
     extrinsics[3, :3, :3] = torch.diag(torch.tensor([-1.0, 1.0, -1.0]))  # this one looks away from the others
     features = torch.randn(count, channels, height, width, generator=torch.Generator().manual_seed(1))
     candidates = torch.linspace(0.01, 2, 11)[None, :, None, None].expand(count, -1, height, width)
     neighbours = torch.tensor([[1, 2], [0, 3], [3, 1], [0, 2]])
-    cameras = Cameras(extrinsics, intrinsics, near, far)
-    found = cost_volume(features, candidates, cameras, neighbours)
-
     pixels = scale_intrinsics(intrinsics, height, width)
+    found = form(features, neighbours, *sampling_points(candidates, pixels, extrinsics, neighbours))
+
     x, y, front = project_candidates(candidates, pixels, extrinsics, neighbours)
     grid = torch.stack([2 * x / (width - 1) - 1, 2 * y / (height - 1) - 1], dim=-1)
     grid = torch.where(front[..., None], grid, torch.full((), 9.0))
     sources = features[neighbours].flatten(0, 1)
     warped = torch.nn.functional.grid_sample(sources, grid, align_corners=True)  # [pairs, channels, candidates, h * w]
     own = features.flatten(2).repeat_interleave(2, 0)[:, :, None]
-    expected = (warped * own).sum(1).unflatten(0, (count, 2)).mean(1) / channels**0.5
+    expected = (warped * own).sum(1)
     assert (expected != 0).float().mean() > 0.3
-    torch.testing.assert_close(found.flatten(2), expected, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-4)
