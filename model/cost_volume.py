@@ -1,7 +1,7 @@
 """How well each pixel matches its neighbours at each candidate depth, by bilinear warping (plane sweep).
 
-Three forms of the same sums. PyTorch has an operator that samples features, which are then scored. In ONNX that operator,
-GridSample, is slow on CPUs and missing elsewhere. Interpolation and inner product commute, so a graph scores whole pixels
+Three forms of the same sums. PyTorch has an operator that samples features, which are then scored. In ONNX it is called
+GridSample, slow on CPUs and missing elsewhere. Interpolation and inner product commute, so a graph scores whole pixels
 first and interpolates between four scores.
 """
 
