@@ -4,7 +4,7 @@ import json
 import sys
 import time
 from collections import Counter
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,12 +17,14 @@ from .sizes import parse_size
 if TYPE_CHECKING:
     import numpy as np
 
+    from .cleaning import Cleaning
     from .runner import Prediction, Runner
     from .views import Views
 
 DEFAULT_VIEWS = 2
 # Frames of the path that --render draws from the first view to the last.
 PATH_FRAMES = 24
+CLEANING = "Cleaning (off unless asked for)"
 
 
 @exit_on_input_error
@@ -41,19 +43,52 @@ def infer(
     provider: Annotated[str, typer.Option(help="ONNX Runtime execution provider, such as CPU or CUDA.")] = "CPU",
     save_depth: Annotated[Path | None, typer.Option(help="Folder for depth maps (.png and metric .npz).")] = None,
     render: Annotated[Path | None, typer.Option(help="Folder for views drawn from the result.")] = None,
+    min_opacity: Annotated[float, typer.Option(help="Leave out fainter Gaussians.", rich_help_panel=CLEANING)] = 0,
+    trim_border: Annotated[
+        int, typer.Option(help="Leave out this many pixels along every picture's edges.", rich_help_panel=CLEANING)
+    ] = 0,
+    trim_edges: Annotated[
+        float,
+        typer.Option(
+            help="Leave out pixels whose depth differs from a neighbour's by more than this share, such as 0.05.",
+            rich_help_panel=CLEANING,
+        ),
+    ] = 0,
+    min_confidence: Annotated[
+        float,
+        typer.Option(
+            help="Leave out pixels whose depth a smaller share of the other views confirms, such as 0.5.",
+            rich_help_panel=CLEANING,
+        ),
+    ] = 0,
+    merge_duplicates: Annotated[
+        bool,
+        typer.Option(
+            "--merge-duplicates",
+            help="Make one Gaussian of those that views put at the same place.",
+            rich_help_panel=CLEANING,
+        ),
+    ] = False,
     timings: Annotated[bool, typer.Option("--timings", help="Print seconds by stage.")] = False,
     json_path: Annotated[Path | None, typer.Option("--json", help="Write a summary as JSON.")] = None,
 ) -> None:
     """Turn posed photographs into a 3D Gaussian splat that every viewer opens."""
+    from .cleaning import Cleaning
+
     started = time.perf_counter()
     _check_outputs(out, save_depth, render, json_path)
     _check_range(near, far)
+    cleaning = Cleaning(min_opacity, trim_border, trim_edges, min_confidence, merge_duplicates)
     prepared, runner, taken = _load([*images, *(more_images or [])], cameras, model, provider, views, size)
     prediction = _predict(prepared, runner, near, far)
+    cleaned: dict[str, int] = {}
+    if cleaning.asked:
+        prediction, cleaned = _clean(prediction, prepared, cleaning)
     written = _write(prediction, prepared, out, save_depth, render)
     seconds = {"load": runner.load_seconds, **prediction.seconds, "total": time.perf_counter() - started}
     if json_path is not None:
         summary = _summary(prediction, prepared, runner, near, far, seconds, written)
+        summary["cleaned"] = {"asked": asdict(cleaning), "left_out": cleaned}
         with replacing(json_path) as temporary:
             temporary.write_text(json.dumps(summary, indent=2) + "\n")
         written.append(json_path)
@@ -118,6 +153,15 @@ def _predict(views: "Views", runner: "Runner", near: float | None, far: float | 
 
     with Console(stderr=True).status("predicting depth and Gaussians"):
         return runner.predict_arrays(views.images, views.extrinsics, views.intrinsics, near, far)
+
+
+def _clean(prediction: "Prediction", views: "Views", cleaning: "Cleaning") -> "tuple[Prediction, dict[str, int]]":
+    """The prediction without what is to be left out, and how much that was."""
+    from .cleaning import clean, describe
+
+    gaussians, taken = clean(prediction.gaussians, prediction.depth, views.extrinsics, views.intrinsics, cleaning)
+    print(describe(taken, len(gaussians)))
+    return replace(prediction, gaussians=gaussians), taken
 
 
 def _write(

@@ -12,6 +12,7 @@ from .errors import InputError, exit_on_input_error
 def convert(
     scene: Annotated[Path, typer.Argument(help="Splat file to read.", show_default=False)],
     out: Annotated[Path, typer.Argument(help="File to write.", show_default=False)],
+    min_opacity: Annotated[float, typer.Option(help="Leave out fainter Gaussians, 0 to 1.")] = 0,
 ) -> None:
     """Write a splat file in another format, which follows from the file's name.
 
@@ -24,7 +25,14 @@ def convert(
     check_writable(out.parent)
     if scene.exists() and out.exists() and scene.samefile(out):
         raise InputError(f"{out}: is the file to read; choose another one to write")
+    if not 0 <= min_opacity <= 1:
+        raise InputError(f"--min-opacity {min_opacity:g}: expected a number from 0 to 1")
     gaussians = read_scene(scene)
+    if min_opacity:
+        whole, gaussians = len(gaussians), gaussians.taken(gaussians.opacities >= min_opacity)
+        if not len(gaussians):
+            raise InputError(f"--min-opacity {min_opacity:g}: no Gaussian is left of {whole}; use a smaller one")
+        print(f"cleaned: {whole - len(gaussians):,} too faint; {len(gaussians):,} Gaussians left")
     for note in write_scene(out, gaussians):
         print(f"note: {note}")
     print(f"wrote {out}: {len(gaussians):,} Gaussians, {out.stat().st_size / 1e6:.1f} MB")

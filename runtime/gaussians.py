@@ -42,6 +42,10 @@ class Gaussians:
     def __len__(self) -> int:
         return len(self.means)
 
+    def taken(self, index: np.ndarray) -> "Gaussians":
+        """Some of the Gaussians: those that a mask keeps, or these, in this order."""
+        return Gaussians(*(getattr(self, field.name)[index] for field in fields(self)))
+
     @property
     def sh_degree(self) -> int:
         """Degree of the spherical harmonics, 0 to 3."""

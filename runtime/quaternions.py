@@ -34,3 +34,32 @@ def from_smallest_three(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
     rest = np.sqrt(np.maximum(1 - np.square(others).sum(axis=1), 0))
     np.put_along_axis(quats, largest[:, None], rest[:, None], axis=1)
     return quats
+
+
+def rotation_matrices(quats: np.ndarray) -> np.ndarray:
+    """Rotation matrices [n, 3, 3], float64, of quaternions wxyz [n, 4] of any length; zero means no rotation."""
+    quats = quats.astype(np.float64)
+    w, x, y, z = (quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)).T
+    rotations = np.empty((len(quats), 3, 3))
+    rotations[:, 0] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=1)
+    rotations[:, 1] = np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=1)
+    rotations[:, 2] = np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1)
+    return rotations
+
+
+def quaternions_from_matrices(rotations: np.ndarray) -> np.ndarray:
+    """Unit quaternions wxyz [n, 4] of rotation matrices [n, 3, 3].
+
+    Each row of the symmetric matrix below is the quaternion times four of its parts; the longest row is the exactest.
+    """
+    (m00, m01, m02), (m10, m11, m12), (m20, m21, m22) = np.moveaxis(rotations, 0, -1)
+    rows = [
+        [1 + m00 + m11 + m22, m21 - m12, m02 - m20, m10 - m01],
+        [m21 - m12, 1 + m00 - m11 - m22, m10 + m01, m02 + m20],
+        [m02 - m20, m10 + m01, 1 - m00 + m11 - m22, m21 + m12],
+        [m10 - m01, m02 + m20, m21 + m12, 1 - m00 - m11 + m22],
+    ]
+    table = np.moveaxis(np.array(rows), -1, 0)  # [n, 4, 4]
+    longest = np.linalg.norm(table, axis=2).argmax(axis=1)
+    chosen = table[np.arange(len(table)), longest]
+    return chosen / np.linalg.norm(chosen, axis=1, keepdims=True)

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, DTypeLike
 
 from .errors import InputError
 from .gaussians import SH_0
+from .quaternions import rotation_matrices
 
 DILATION = 0.3  # px^2, added to the projected covariance: no splat is thinner than a pixel
 FIELD_OF_VIEW_MARGIN = 0.3  # share of the half image by which the Jacobian's direction may leave the image
@@ -172,7 +173,7 @@ def _ellipses(points: np.ndarray, gaussians: _Gaussians, camera: _Camera) -> _Sp
     to_camera = camera.viewmat[:3, :3]
     jacobian_x = (fx / z)[:, None] * (to_camera[0] - across[:, None] * to_camera[2])  # [splats, 3]
     jacobian_y = (fy / z)[:, None] * (to_camera[1] - down[:, None] * to_camera[2])
-    axes = _rotations(gaussians.quats) * gaussians.scales[:, None, :]  # [splats, 3, 3], the scaled axes as columns
+    axes = rotation_matrices(gaussians.quats) * gaussians.scales[:, None, :]  # [splats, 3, 3], as columns, scaled
     half_x = np.einsum("ni,nij->nj", jacobian_x, axes)
     half_y = np.einsum("ni,nij->nj", jacobian_y, axes)
     x_variance = np.einsum("ni,ni->n", half_x, half_x) + DILATION
@@ -186,17 +187,6 @@ def _ellipses(points: np.ndarray, gaussians: _Gaussians, camera: _Camera) -> _Sp
     _, columns = _span(x, np.sqrt(2 * reach * x_variance), width)
     paint = np.empty((len(points), 4), np.float32)
     return _Splats(x, y, shear, row_variance, y_variance, reach, first_row, rows, columns, paint)
-
-
-def _rotations(quats: np.ndarray) -> np.ndarray:
-    """Rotation matrices [splats, 3, 3] of wxyz quaternions, which are normalised first; zero means no rotation."""
-    quats = quats.astype(np.float64)
-    w, x, y, z = (quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)).T
-    rotations = np.empty((len(quats), 3, 3))
-    rotations[:, 0] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=1)
-    rotations[:, 1] = np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=1)
-    rotations[:, 2] = np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1)
-    return rotations
 
 
 def _span(centre: np.ndarray, half: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:

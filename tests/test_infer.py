@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from conftest import run_command
 from idesplat.runtime.cli import main
+from idesplat.runtime.formats import read_scene
 from idesplat.runtime.ply import read_ply
 from idesplat.runtime.render import main as render_main
 
@@ -56,6 +57,19 @@ def test_staged_folder_and_a_list_of_files(workplace, exported):
     arguments = ("--images", *files, "--cameras", "transforms.json", "--model", exported[1], "--out", "scene.ply")
     assert run_command(main, *arguments) == 0
     assert len(read_ply(Path("scene.ply"))) == 2 * 64 * 96
+
+
+def test_cleaning_is_counted_and_formats_follow_the_name(workplace, capsys):
+    cleaning = ("--trim-border", "4", "--min-opacity", "0.01", "--merge-duplicates")
+    arguments = (*USUAL[:-1], "scene.spz", "--json", "summary.json", *cleaning)
+    assert run_command(main, *arguments) == 0
+    summary = json.loads(Path("summary.json").read_text())
+    left_out = summary["cleaned"]["left_out"]
+    assert list(left_out) == ["min_opacity", "trim_border", "merge_duplicates"]
+    assert left_out["trim_border"] > 0
+    left = len(read_scene(Path("scene.spz")))
+    assert left == summary["gaussians"] == 2 * 64 * 96 - sum(left_out.values())
+    assert f"{left:,} Gaussians left" in capsys.readouterr().out
 
 
 def test_portrait_photographs_and_another_size(workplace):
@@ -127,6 +141,8 @@ BAD = {
     "a provider that is not installed": (nothing, ("--provider", "CUDA"), "CUDA"),
     "an output folder that is not there": (nothing, ("--out", "nowhere/scene.ply"), "nowhere"),
     "an output folder that nobody may write to": (nothing, ("--out", "/proc/scene.ply"), "cannot write into /proc"),
+    "a share that is none": (nothing, ("--min-opacity", "2"), "--min-opacity 2"),
+    "a border wider than the pictures": (nothing, ("--trim-border", "32"), "--trim-border 32"),
     "an output that is no splat file": (nothing, ("--out", "scene.txt"), ".ply"),
     "an output folder that is a file": (nothing, ("--save-depth", "transforms.json"), "transforms.json"),
 }
