@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from idesplat.runtime.cameras import read_cameras
+from idesplat.runtime.depth_range import DepthRange
 from idesplat.runtime.images import find_images
 from idesplat.runtime.views import match
 from idesplat.tools.baselines import best_plane, nearest_view, warp_plane
@@ -43,7 +44,7 @@ def inner(picture: np.ndarray) -> np.ndarray:
     return picture[8:-8, 8:-8]
 
 
-@pytest.mark.parametrize(("near", "far"), [(0.5, 100.0), (2.0, 9.0)])
+@pytest.mark.parametrize(("near", "far"), [(0.5, 100.0), (2.0, 9.0), (5.0, 9.0), (1.0, 3.0)])
 def test_finds_the_plane_that_all_is_on(near: float, far: float) -> None:
     context, target = posed(CONTEXT), posed([STRAIGHT])
     everywhere = np.ones((HEIGHT, WIDTH), bool)
@@ -90,7 +91,7 @@ def test_the_nearest_view_fills_what_none_sees() -> None:
 def test_no_plane_of_a_dense_sweep_is_better(scene) -> None:
     """On a furnished room, where no plane fits."""
     frames = match(find_images([scene / "images"]), read_cameras(scene / "transforms.json"))
-    case = load_case(frames, [1, 3], [2], 64, 96)
+    case = load_case(frames, [1, 3], [2], (64, 96), lambda views: DepthRange(0.5, 100.0, "guessed"))
     context, truth, valid = case.context, case.targets.picture(0), case.targets.valid[0]
     pose, K = case.targets.extrinsics[0], case.targets.K(0)
     picture, depth = best_plane(context, truth, valid, pose, K, 0.5, 100.0)

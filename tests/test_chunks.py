@@ -15,7 +15,7 @@ from idesplat.tools import chunks
 from idesplat.tools.chunks import Entry, chunk_cases, find_chunks, read_chunk, read_index
 from PIL import Image
 
-HEIGHT, WIDTH = 64, 64  # of photographs 96 x 128
+SIZE, RANGE = (64, 64), (0.5, 100.0)  # of photographs 96 x 128
 
 
 def as_scene(folder: Path, key: str) -> dict[str, Any]:
@@ -45,10 +45,10 @@ def no_skip(key: str, reason: str) -> None:
 
 def test_cases_are_the_indexed_frames_as_the_papers_prepare_them(folder: Path, scene: Path) -> None:
     index = {"b": Entry([0, 4], [1, 3]), "d": Entry([1, 2, 3], [2])}
-    first, second = chunk_cases(find_chunks(folder), index, HEIGHT, WIDTH, no_skip)
+    first, second = chunk_cases(find_chunks(folder), index, SIZE, RANGE, no_skip)
     assert (first.name, first.context.names, first.targets.names) == ("b", ["0", "4"], ["1", "3"])
     assert (second.name, second.context.names, second.targets.names) == ("d", ["1", "2", "3"], ["2"])
-    assert first.near is None and first.depth is None and first.targets.valid.all()
+    assert (first.near, first.far) == RANGE and first.depth is None and first.targets.valid.all()
 
     cameras = read_cameras(scene / "transforms.json")
     np.testing.assert_allclose(first.context.extrinsics[1], cameras[4].extrinsics, atol=1e-5)
@@ -60,7 +60,7 @@ def test_cases_are_the_indexed_frames_as_the_papers_prepare_them(folder: Path, s
 
 
 def test_intrinsics_follow_the_crop(folder: Path, scene: Path) -> None:
-    (case,) = chunk_cases(find_chunks(folder), {"a": Entry([0, 1], [2])}, HEIGHT, WIDTH, no_skip)
+    (case,) = chunk_cases(find_chunks(folder), {"a": Entry([0, 1], [2])}, SIZE, RANGE, no_skip)
     K = read_cameras(scene / "transforms.json")[2].K
     x, y, _ = K @ (0.1, -0.05, 1)  # in the photograph
     expected = x * 85 / 128 - 10, y * 64 / 96  # scaled to 85 x 64, cut from column 10
@@ -178,7 +178,7 @@ def test_refuses_damaged_chunks(folder: Path) -> None:
 
 def test_an_index_of_another_dataset(folder: Path) -> None:
     with pytest.raises(InputError, match="scene c has 5 frames and the index asks for number 58"):
-        list(chunk_cases(find_chunks(folder), {"c": Entry([0, 58], [1])}, HEIGHT, WIDTH, no_skip))
+        list(chunk_cases(find_chunks(folder), {"c": Entry([0, 58], [1])}, SIZE, RANGE, no_skip))
 
 
 @pytest.mark.parametrize(
@@ -197,7 +197,7 @@ def test_skips_scenes_that_are_damaged(spoil: Callable, expected: str, scene: Pa
     torch.save([content, as_scene(scene, "b")], tmp_path / "0.torch")
     skipped: dict[str, str] = {}
     index = {key: Entry([0, 1], [2]) for key in "ab"}
-    (case,) = chunk_cases(find_chunks(tmp_path), index, HEIGHT, WIDTH, skipped.__setitem__)
+    (case,) = chunk_cases(find_chunks(tmp_path), index, SIZE, RANGE, skipped.__setitem__)
     assert case.name == "b" and list(skipped) == ["a"]
     with pytest.raises(InputError, match=expected):
         raise InputError(skipped["a"])

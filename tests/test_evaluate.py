@@ -80,12 +80,13 @@ def test_scene_measures_what_the_library_gives(workplace: Path, opened: Runner, 
     assert scores["model"]["psnr"] == pytest.approx(psnr, abs=1e-3)
     assert scores["model"]["ssim"] == pytest.approx(ssim, abs=1e-4)
     assert scores["plane"]["psnr"] > scores["nearest"]["psnr"] > 5
+    assert (only["near"], only["far"]) == (1, 20)
     assert 1 <= only["targets"][1]["details"]["plane_depth"] <= 20
     mean = np.mean([target["scores"]["model"]["psnr"] for target in only["targets"]])
     assert content["mean"]["model"]["psnr"] == pytest.approx(mean)
 
     frames = match(find_images(["images"]), read_cameras("transforms.json"))
-    truth = load_case(frames, [0, 4], [1], 64, 96, Path("depth")).depth
+    truth = load_case(frames, [0, 4], [1], (64, 96), opened.depth_range, Path("depth")).depth
     error = np.abs(prediction.depth - truth) / truth
     assert only["depth"]["abs_rel"] == pytest.approx(error.mean(), rel=1e-4)
     assert only["depth"]["within_5_percent"] == pytest.approx((error < 0.05).mean(), abs=1e-3)
@@ -117,7 +118,7 @@ def test_chunks_give_the_papers_means(workplace: Path, opened: Runner, capsys: C
     assert list(content["mean"]) == ["model"]
     values = [target["scores"]["model"]["psnr"] for target in only["targets"]]
     assert content["mean"]["model"]["psnr"] == pytest.approx(np.mean(values))
-    (case,) = chunk_cases([Path("chunks/000000.torch")], {"b": Entry([0, 4], [2])}, 64, 96, print)
+    (case,) = chunk_cases([Path("chunks/000000.torch")], {"b": Entry([0, 4], [2])}, (64, 96), (0.5, 100.0), print)
     given = case.context
     prediction = opened.predict_arrays(given.images, given.extrinsics, given.intrinsics)
     truth = case.targets.picture(0)
@@ -199,8 +200,10 @@ BAD = {
     "cameras at one place": (cameras_at_one_place, (*SCENE, *NAMED), "same place"),
     "no model": (nothing, (*SCENE, "--model", "none.onnx"), "none.onnx"),
     "a size it cannot take": (nothing, (*SCENE, "--size", "64x50"), "multiples of 16"),
-    "near behind far": (nothing, (*SCENE, "--near", "5", "--far", "2"), "expected beyond near"),
-    "near of zero": (nothing, (*SCENE, "--near", "0"), "near"),
+    "near behind far": (nothing, (*SCENE, "--near", "5", "--far", "2"), "expected 0 < near < far"),
+    "near of zero": (nothing, (*SCENE, "--near", "0"), "expected 0 < near < far"),
+    "near of nothing": (nothing, (*CHUNKS, "--near", "nan"), "expected 0 < near < far"),
+    "near behind the model's far": (nothing, (*CHUNKS, "--near", "200"), "near 200 and far 100"),
     "no depth": (nothing, (*SCENE, "--depth", "images"), "no readable depth"),
     "an output folder that nobody may write to": (nothing, (*SCENE, "--out", "/proc"), "cannot write into /proc"),
     "an output folder that is a file": (nothing, (*SCENE, "--out", "transforms.json"), "transforms.json"),

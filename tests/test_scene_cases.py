@@ -9,13 +9,19 @@ import cv2
 import numpy as np
 import pytest
 from idesplat.runtime.cameras import Camera, read_cameras
+from idesplat.runtime.depth_range import DepthRange
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.images import find_images
-from idesplat.runtime.views import match
+from idesplat.runtime.views import Views, match, prepare
 from idesplat.tools.scene_cases import Frame, chosen_frames, context_for, load_case
 from idesplat.tools.scenes import look_at
 
-HEIGHT, WIDTH = 64, 96  # of photographs 96 x 128: scaled to 72 x 96, four rows cut above and below
+SIZE = HEIGHT, WIDTH = 64, 96  # of photographs 96 x 128: scaled to 72 x 96, four rows cut above and below
+
+
+def find_range(views: Views) -> DepthRange:
+    """From the number of views, to know what it was asked for."""
+    return DepthRange(1, 10 * len(views.names), "the test")
 
 
 def frames_of(folder: Path) -> list[Frame]:
@@ -77,15 +83,14 @@ def test_refuses(context: list[str], targets: list[str], views: int, expected: s
 
 
 def test_pictures_as_the_runtime_prepares_them(scene: Path) -> None:
-    from idesplat.runtime.views import prepare
-
     frames = frames_of(scene)
-    case = load_case(frames, [0, 4], [2, 1], HEIGHT, WIDTH)
+    case = load_case(frames, [0, 4], [2, 1], SIZE, find_range)
     assert (case.name, case.context.names, case.targets.names) == (
         "000+004",
         ["000.png", "004.png"],
         ["002.png", "001.png"],
     )
+    assert (case.near, case.far) == (1, 20)
     views = prepare([frames[index] for index in (0, 4, 2, 1)], None, HEIGHT, WIDTH)
     np.testing.assert_array_equal(np.concatenate([case.context.images, case.targets.images]), views.images)
     np.testing.assert_array_equal(case.targets.extrinsics, views.extrinsics[2:])
@@ -102,7 +107,7 @@ def test_black_borders_do_not_count(scene: Path, tmp_path: Path) -> None:
     image[:, :16] = 3  # as an undistorted photograph has it
     image[50:56, 60:70] = 0  # something black in the middle
     cv2.imwrite(str(path), image)
-    case = load_case(frames_of(tmp_path / "scene"), [0, 4], [2], HEIGHT, WIDTH)
+    case = load_case(frames_of(tmp_path / "scene"), [0, 4], [2], SIZE, find_range)
     (valid,) = case.targets.valid
     # sixteen columns and a block of JPEG are eighteen columns here, beside which two are left out
     assert not valid[:, :18].any() and valid[:, 22:].all()
@@ -112,7 +117,7 @@ def test_black_borders_do_not_count(scene: Path, tmp_path: Path) -> None:
 def test_what_the_lens_did_not_see_does_not_count(scene: Path) -> None:
     frames = frames_of(scene)
     bent = [(path, replace(camera, distortion=(0.3, 0.0, 0.0, 0.0))) for path, camera in frames]
-    (valid,) = load_case(bent, [0, 4], [2], HEIGHT, WIDTH).targets.valid
+    (valid,) = load_case(bent, [0, 4], [2], SIZE, find_range).targets.valid
     assert valid[16:48, 24:72].all() and not valid[0, 0] and 0.5 < valid.mean() < 0.99
 
 
@@ -122,7 +127,7 @@ def test_true_depth_at_the_pixels_of_the_network(along: str, scene: Path, tmp_pa
     y, x = np.meshgrid(np.arange(96) + 0.5, np.arange(128) + 0.5, indexing="ij")
     for name in ("000", "004"):
         np.savez(tmp_path / f"{name}.npz", depth=y if along == "rows" else x)
-    case = load_case(frames_of(scene), [0, 4], [2], HEIGHT, WIDTH, tmp_path)
+    case = load_case(frames_of(scene), [0, 4], [2], SIZE, find_range, tmp_path)
     assert case.depth is not None and case.depth.shape == (2, HEIGHT, WIDTH)
     rows, columns = (np.arange(HEIGHT) + 0.5 + 4) / 0.75, (np.arange(WIDTH) + 0.5) / 0.75
     expected = rows[:, None] if along == "rows" else columns[None]
@@ -132,20 +137,20 @@ def test_true_depth_at_the_pixels_of_the_network(along: str, scene: Path, tmp_pa
 def test_refuses_depth_that_does_not_fit(scene: Path, tmp_path: Path) -> None:
     frames = frames_of(scene)
     with pytest.raises(InputError, match=r"000\.npz: no readable depth"):
-        load_case(frames, [0, 4], [2], HEIGHT, WIDTH, tmp_path)
+        load_case(frames, [0, 4], [2], SIZE, find_range, tmp_path)
     np.savez(tmp_path / "000.npz", depth=np.ones((9, 9)))
     with pytest.raises(InputError, match=r"depth of shape \(9, 9\), expected \(96, 128\)"):
-        load_case(frames, [0, 4], [2], HEIGHT, WIDTH, tmp_path)
+        load_case(frames, [0, 4], [2], SIZE, find_range, tmp_path)
     bent = [(path, replace(camera, distortion=(0.1, 0.0, 0.0, 0.0))) for path, camera in frames]
     with pytest.raises(InputError, match="lens distortion"):
-        load_case(bent, [0, 4], [2], HEIGHT, WIDTH, scene / "depth")
+        load_case(bent, [0, 4], [2], SIZE, find_range, scene / "depth")
 
 
 def test_refuses_a_black_picture(scene: Path, tmp_path: Path) -> None:
     shutil.copytree(scene, tmp_path / "scene")
     cv2.imwrite(str(tmp_path / "scene" / "images" / "002.png"), np.zeros((96, 128, 3), np.uint8))
     with pytest.raises(InputError, match=r"002\.png: is black"):
-        load_case(frames_of(tmp_path / "scene"), [0, 4], [2], HEIGHT, WIDTH)
+        load_case(frames_of(tmp_path / "scene"), [0, 4], [2], SIZE, find_range)
 
 
 def test_two_frames_at_one_pose(scene: Path, tmp_path: Path) -> None:
@@ -154,4 +159,4 @@ def test_two_frames_at_one_pose(scene: Path, tmp_path: Path) -> None:
     cameras["frames"][2]["transform_matrix"] = cameras["frames"][0]["transform_matrix"]
     (tmp_path / "scene" / "transforms.json").write_text(json.dumps(cameras))
     with pytest.raises(InputError, match="same pose"):
-        load_case(frames_of(tmp_path / "scene"), [0, 4], [2], HEIGHT, WIDTH)
+        load_case(frames_of(tmp_path / "scene"), [0, 4], [2], SIZE, find_range)

@@ -12,6 +12,7 @@ from .cases import Posed
 
 # Planes that are tried: at first neighbours move no pixel by much more than one, then around the best ones closer.
 FEWEST_PLANES, MOST_PLANES = 64, 1024
+BEYOND = 2
 KEPT = 3
 CLOSER = 8
 ROUNDS = 2
@@ -32,8 +33,11 @@ def best_plane(
     near: float,
     far: float,
 ) -> tuple[np.ndarray, float]:
-    """The picture [height, width, 3] of the plane between near and far that is most like the truth, and its depth."""
-    low, high = 1 / far, 1 / near
+    """The picture [height, width, 3] of the plane that is most like the truth, and its depth.
+
+    near, far: the scene's depth range. It may be a guess, so planes to twice either side of it are tried.
+    """
+    low, high = 1 / (BEYOND * far), BEYOND / near
     pixels = float(max(_distances(context, extrinsics)) * K[0, 0] * (high - low))  # that the nearest plane moves
     candidates = np.linspace(low, high, min(max(ceil(pixels), FEWEST_PLANES), MOST_PLANES) + 1)
     step = candidates[1] - candidates[0]

@@ -39,15 +39,15 @@ class Posed:
 class Case:
     """Context views for a network, and target views of the same scene that it does not see.
 
-    near, far: scene units; None for the model's own. depth: true z-depth of the context views in scene units,
+    near, far: the depth range, in scene units. depth: true z-depth of the context views in scene units,
     [views, height, width], not positive where unknown; None where there is none.
     """
 
     name: str
     context: Posed
     targets: Posed
-    near: float | None = None
-    far: float | None = None
+    near: float
+    far: float
     depth: np.ndarray | None = None
 
 

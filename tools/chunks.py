@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from ..runtime.cameras import check_intrinsics, located, rigid
+from ..runtime.cameras import check_intrinsics, invert_rigid, located
 from ..runtime.errors import InputError
 from ..runtime.images import cover, fit
 from .cases import Case, Posed
@@ -98,10 +98,15 @@ def read_chunk(path: Path) -> list[dict[str, Any]]:
 
 
 def chunk_cases(
-    chunks: list[Path], index: dict[str, Entry], height: int, width: int, skip: Callable[[str, str], None]
+    chunks: list[Path],
+    index: dict[str, Entry],
+    size: tuple[int, int],
+    depth_range: tuple[float, float],
+    skip: Callable[[str, str], None],
 ) -> Iterator[Case]:
     """The indexed scenes of the chunks, in their order, prepared as the papers do; `skip` hears a scene and why.
 
+    size: height and width. depth_range: near and far, the same for all scenes.
     Scenes with a damaged picture or an impossible pose are skipped, as the releases do. Raises InputError as
     `read_chunk` does, and for frames that a scene has not.
     """
@@ -117,12 +122,11 @@ def chunk_cases(
                     f"{last}; give the index that was made for this dataset"
                 )
             try:
-                context = _posed(scene, entry.context, height, width)
-                targets = _posed(scene, entry.target, height, width)
+                context, targets = (_posed(scene, frames, *size) for frames in (entry.context, entry.target))
             except InputError as error:
                 skip(scene["key"], str(error))
                 continue
-            yield Case(scene["key"], context, targets)
+            yield Case(scene["key"], context, targets, *depth_range)
 
 
 def _entry(value: object, where: str) -> Entry:
@@ -161,7 +165,7 @@ def _posed(scene: dict[str, Any], frames: list[int], height: int, width: int) ->
             image, k = _fitted(_decoded(scene["images"][frame].numpy()), K, height, width)
         images.append(image)
         intrinsics.append(k)
-        extrinsics.append(pose.astype(np.float32))
+        extrinsics.append(pose)
     names = [str(frame) for frame in frames]
     valid = np.ones((len(frames), height, width), bool)
     return Posed(names, np.stack(images), np.stack(extrinsics), np.stack(intrinsics), valid)
@@ -172,11 +176,8 @@ def _camera(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     fx, fy, cx, cy = numbers[:4]
     intrinsics = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     check_intrinsics(intrinsics, 1, 1)
-    world_to_camera = rigid(np.vstack([numbers[FIRST_POSE_NUMBER:].reshape(3, 4), [0, 0, 0, 1]]))
-    pose = np.eye(4)
-    pose[:3, :3] = world_to_camera[:3, :3].T
-    pose[:3, 3] = -pose[:3, :3] @ world_to_camera[:3, 3]
-    return intrinsics, pose
+    world_to_camera = np.vstack([numbers[FIRST_POSE_NUMBER:].reshape(3, 4), [0, 0, 0, 1]])
+    return intrinsics, invert_rigid(world_to_camera)
 
 
 def _decoded(content: np.ndarray) -> np.ndarray:
@@ -193,8 +194,8 @@ def _decoded(content: np.ndarray) -> np.ndarray:
 def _fitted(image: np.ndarray, K: np.ndarray, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     """The picture covering height x width, float32 [3, height, width], and its normalised intrinsics [3, 3].
 
-    The papers scale with Pillow's Lanczos filter, which is sharper than what `fit` does for photographs: a decibel is
-    easily hidden there.
+    The papers scale with Pillow's Lanczos filter, which is sharper than what `fit` does for photographs. On three views
+    of real photographs that alone cost a warped plane 0.3 to 0.6 dB.
     """
     from PIL import Image
 

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -34,8 +35,8 @@ Model = Annotated[
     Path | None, typer.Option(help="A .onnx or staged folder of idesplat-export instead of the carried model.")
 ]
 Size = Annotated[str | None, typer.Option(help="HEIGHTxWIDTH to work at instead of the trained size.")]
-Near = Annotated[float | None, typer.Option(help="Nearest depth in scene units instead of the model's.")]
-Far = Annotated[float | None, typer.Option(help="Farthest depth in scene units instead of the model's.")]
+Near = Annotated[float | None, typer.Option(help="Nearest depth in scene units.")]
+Far = Annotated[float | None, typer.Option(help="Farthest depth in scene units.")]
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, help=__doc__)
 
@@ -69,18 +70,17 @@ def scene(
     frames = match(found, read_cameras(cameras, found))
     runner = _runner(model, out)
     chosen = chosen_frames(frames, context or [], target or [], runner.description.fixed_views or views, hold_out_every)
-    height, width = parse_size(size) if size else runner.size_for([camera for _, camera in frames])
+    shape = parse_size(size) if size else runner.size_for([camera for _, camera in frames])
     for sources, held_out in chosen:
-        runner.check_size(len(sources), height, width)
+        runner.check_size(len(sources), *shape)
         print(f"held out {_names(frames, held_out)}, inferred from {_names(frames, sources)}")
-    cases = (load_case(frames, *numbers, height, width, depth) for numbers in chosen)
-    evaluator = Evaluator(runner, load_lpips(), near=near, far=far)
-    results = _evaluate(cases, len(chosen), evaluator, out, pictured=len(chosen))
+    find_range = partial(runner.depth_range, near=near, far=far)
+    cases = (load_case(frames, *numbers, shape, find_range, depth) for numbers in chosen)
+    results = _evaluate(cases, len(chosen), Evaluator(runner, load_lpips()), out, pictured=len(chosen))
     means = mean_of_views(results)
     print_views(results)
-    print_means(means, f"{sum(len(result.targets) for result in results)} views held out, {height}x{width}")
-    about = {"command": "scene", "images": str(images), "height": height, "width": width, "near": near, "far": far}
-    _write(out, about, runner, means, results)
+    print_means(means, f"{sum(len(result.targets) for result in results)} views held out, {_by(shape)}")
+    _write(out, {"command": "scene", "images": str(images), "size": shape}, runner, means, results)
 
 
 @app.command()
@@ -96,18 +96,23 @@ def chunks(
     """Evaluate on RealEstate10K, ACID or DL3DV as the papers do: pixelSplat's chunks, a published index of frames."""
     from .chunks import NEAREST_DRAWN, chunk_cases, find_chunks, read_index
     from .metrics import load_lpips
-    from .novel_views import Evaluator, first_given, mean_of_scenes
+    from .novel_views import Evaluator, mean_of_scenes
     from .report import print_means
 
     entries, files = read_index(index), find_chunks(folder)
     runner = _runner(model, out)
-    height, width = runner.description.height, runner.description.width
+    own = runner.description
     for views in sorted({len(entry.context) for entry in entries.values()}):
-        runner.check_size(views, height, width)
-    nearest_drawn = NEAREST_DRAWN * first_given(near, runner.description.near)
-    evaluator = Evaluator(runner, load_lpips(), False, near, far, nearest_drawn)
+        runner.check_size(views, own.height, own.width)
+    shape = own.height, own.width
+    near, far = near if near is not None else own.near, far if far is not None else own.far
+    if not 0 < near < far:
+        raise InputError(
+            f"near {near:g} and far {far:g}: expected 0 < near < far; give --near and --far in scene units"
+        )
+    evaluator = Evaluator(runner, load_lpips(), trivial=False, nearest_drawn=NEAREST_DRAWN * near)
     skipped: dict[str, str] = {}
-    cases = chunk_cases(files, entries, height, width, skipped.__setitem__)
+    cases = chunk_cases(files, entries, shape, (near, far), skipped.__setitem__)
     results = _evaluate(cases, len(entries), evaluator, out, PICTURED, skipped.__setitem__)
     for key, reason in skipped.items():
         print(f"skipped {key}: {reason}")
@@ -118,10 +123,10 @@ def chunks(
             "give the chunks of the test set that the index was made for"
         )
     means = mean_of_scenes(results)
-    print_means(means, f"{len(results)} of the index's {len(entries)} scenes, {height}x{width}")
+    print_means(means, f"{len(results)} of the index's {len(entries)} scenes, {_by(shape)}")
     if missing:
         print(f"{missing} of the index's scenes are not in {folder}")
-    about = {"command": "chunks", "index": str(index), "near": near, "far": far, "skipped": skipped, "missing": missing}
+    about = {"command": "chunks", "index": str(index), "size": shape, "skipped": skipped, "missing": missing}
     _write(out, about, runner, means, results)
 
 
@@ -148,14 +153,13 @@ def procedural(
     from .scenes import HELD_OUT_SEEDS
 
     runner = _runner(model, out)
-    height, width = parse_size(size) if size else (runner.description.height, runner.description.width)
-    runner.check_size(views, height, width)
-    cases = (procedural_case(seed, views, TARGETS, height, width) for seed in HELD_OUT_SEEDS[:scenes])
+    shape = parse_size(size) if size else (runner.description.height, runner.description.width)
+    runner.check_size(views, *shape)
+    cases = (procedural_case(seed, views, TARGETS, *shape) for seed in HELD_OUT_SEEDS[:scenes])
     results = _evaluate(cases, scenes, Evaluator(runner, load_lpips()), out, PICTURED)
     means = mean_of_scenes(results)
-    print_means(means, f"{scenes} held-out procedural scenes, {views} views, {height}x{width}")
-    about = {"command": "procedural", "views": views, "height": height, "width": width}
-    _write(out, about, runner, means, results)
+    print_means(means, f"{scenes} held-out procedural scenes, {views} views, {_by(shape)}")
+    _write(out, {"command": "procedural", "views": views, "size": shape}, runner, means, results)
 
 
 def main() -> None:
@@ -165,6 +169,10 @@ def main() -> None:
 
 def _names(frames: "list[tuple[Path, Camera]]", numbers: list[int]) -> str:
     return ", ".join(frames[number][0].name for number in numbers)
+
+
+def _by(shape: tuple[int, int]) -> str:
+    return f"{shape[0]}x{shape[1]}"
 
 
 def _runner(model: Path | None, out: Path) -> "Runner":
@@ -190,16 +198,15 @@ def _evaluate(
 
     results: list[Result] = []
     for case in track(cases, "Evaluating", total, console=Console(stderr=True), disable=not sys.stderr.isatty()):
-
-        def show(target: str, strip: "np.ndarray", scene: str = case.name) -> None:
-            save_png(out / f"{scene}-{Path(target).stem}.png", strip)
-
+        strips: dict[str, np.ndarray] = {}
         try:
-            results.append(evaluator.evaluate(case, show if len(results) < pictured else None))
+            results.append(evaluator.evaluate(case, strips.__setitem__ if len(results) < pictured else None))
         except InputError as error:
             if skip is None:
                 raise
             skip(case.name, str(error))
+        for target, strip in strips.items():
+            save_png(out / f"{case.name}-{Path(target).stem}.png", strip)
     return results
 
 

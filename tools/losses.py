@@ -136,11 +136,11 @@ def load_perceptual() -> Perceptual | None:
     try:
         import lpips
     except ImportError:
-        print("warning: LPIPS is left out of the loss, since the package lpips is not installed", file=sys.stderr)
+        print("warning: LPIPS is left out, since the package lpips is not installed", file=sys.stderr)
         return None
     weights = Path(torch.hub.get_dir()) / "checkpoints" / VGG_WEIGHTS
     if not weights.is_file():
-        print(f"warning: LPIPS is left out of the loss, since VGG16's weights are not at {weights}", file=sys.stderr)
+        print(f"warning: LPIPS is left out, since VGG16's weights are not at {weights}", file=sys.stderr)
         return None
     network = lpips.LPIPS(net="vgg", verbose=False).requires_grad_(False)
     return lambda rendered, truth: network(rendered, truth, normalize=True).mean()

@@ -47,6 +47,8 @@ class Result:
 
     name: str
     context: list[str]
+    near: float
+    far: float
     targets: list[Target]
     depth: dict[str, float]
 
@@ -56,15 +58,12 @@ class Evaluator:
     """A model and how it is measured.
 
     lpips: the measure, where it is there. trivial: whether the trivial methods are measured too.
-    near, far: scene units, for cases that have none of their own; None for the model's.
     nearest_drawn: scene units from the camera at which Gaussians begin to be drawn.
     """
 
     runner: Runner
     lpips: LPIPS | None
     trivial: bool = True
-    near: float | None = None
-    far: float | None = None
     nearest_drawn: float = NEAREST_DRAWN
 
     def evaluate(self, case: Case, show: Callable[[str, np.ndarray], None] | None = None) -> Result:
@@ -73,10 +72,8 @@ class Evaluator:
         show: is given each target's name and strip: truth, render, error, depth and, if measured, the plane; RGB in
         [0, 1], [height, all widths, 3]. Raises InputError for what the model cannot take.
         """
-        near = first_given(case.near, self.near, self.runner.description.near)
-        far = first_given(case.far, self.far, self.runner.description.far)
-        context = case.context
-        prediction = self.runner.predict_arrays(context.images, context.extrinsics, context.intrinsics, near, far)
+        given = case.context
+        prediction = self.runner.predict_arrays(given.images, given.extrinsics, given.intrinsics, case.near, case.far)
         targets = []
         for view, name in enumerate(case.targets.names):
             truth, valid = case.targets.picture(view), case.targets.valid[view]
@@ -84,23 +81,18 @@ class Evaluator:
             pictures: dict[str, np.ndarray] = {MODEL: drawn.rgb}
             details: dict[str, Any] = {}
             if self.trivial:
-                others, details = _trivial(case, view, near, far)
+                others, details = _trivial(case, view)
                 pictures |= others
             scores = {method: self._measure(picture, truth, valid) for method, picture in pictures.items()}
             targets.append(Target(name, scores, details))
             if show is not None:
                 show(name, _strip(truth, valid, drawn, pictures.get(PLANE)))
         depth = {} if case.depth is None else depth_measures(prediction.depth, case.depth)
-        return Result(case.name, context.names, targets, depth)
+        return Result(case.name, given.names, case.near, case.far, targets, depth)
 
     def _measure(self, picture: np.ndarray, truth: np.ndarray, valid: np.ndarray) -> dict[str, float]:
         scores = {"psnr": psnr(picture, truth, valid), "ssim": ssim(picture, truth, valid)}
         return scores if self.lpips is None else {**scores, "lpips": self.lpips(picture, truth, valid)}
-
-
-def first_given(*values: float | None) -> float:
-    """The first value that is not None."""
-    return next(value for value in values if value is not None)
 
 
 def mean_of_views(results: Sequence[Result]) -> Scores:
@@ -140,11 +132,12 @@ def _mean(entries: list[Scores]) -> Scores:
     }
 
 
-def _trivial(case: Case, view: int, near: float, far: float) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def _trivial(case: Case, view: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The trivial methods' pictures of a target, [height, width, 3], and what they found."""
     context, targets, pose = case.context, case.targets, case.targets.extrinsics[view]
     copied = nearest_view(context, pose)
-    plane, depth = best_plane(context, targets.picture(view), targets.valid[view], pose, targets.K(view), near, far)
+    truth, valid = targets.picture(view), targets.valid[view]
+    plane, depth = best_plane(context, truth, valid, pose, targets.K(view), case.near, case.far)
     pictures = {NEAREST: context.picture(copied), PLANE: plane}
     return pictures, {"nearest_view": context.names[copied], "plane_depth": depth}
 

@@ -1,16 +1,17 @@
 """Cases from a folder of photographs: some are held out, and for each of those a context is chosen among the rest."""
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from ..runtime.cameras import Camera, resized
+from ..runtime.depth_range import DepthRange
 from ..runtime.errors import InputError
 from ..runtime.images import cover, load_image, seen_by_lens
-from ..runtime.views import prepare
+from ..runtime.views import Views, prepare
 from .cases import Case, Posed
 
 Frame = tuple[Path, Camera]
@@ -76,29 +77,37 @@ def load_case(
     frames: Sequence[Frame],
     context: Sequence[int],
     targets: Sequence[int],
-    height: int,
-    width: int,
+    size: tuple[int, int],
+    find_range: Callable[[Views], DepthRange],
     depth: Path | None = None,
 ) -> Case:
     """The frames undistorted, resized and cropped as the network takes them, and which of their pixels are valid.
 
+    size: height and width. find_range: finds near and far from the context views.
     depth: a folder of the context's true z-depth, one .npz for each frame, named like it, with `depth` [height, width]
-    at the photograph's size. Raises InputError for pictures, cameras and depth that cannot be used.
+    at the photograph's size.
+    Raises InputError for pictures, cameras and depth that cannot be used.
     """
     chosen = [frames[number] for number in (*context, *targets)]
-    views = prepare(chosen, None, height, width)
-    valid = np.stack([_valid_pixels(path, camera, height, width) for path, camera in chosen])
+    views = prepare(chosen, None, *size)
+    valid = np.stack([_valid_pixels(path, camera, *size) for path, camera in chosen])
     for name, seen in zip(views.names, valid, strict=True):
         if seen.mean() < LEAST_VALID:
             raise InputError(f"{name}: is black nearly everywhere, or its distortion wrong; expected a photograph")
 
-    def posed(part: slice) -> Posed:
-        return Posed(views.names[part], views.images[part], views.extrinsics[part], views.intrinsics[part], valid[part])
+    def taken(part: slice) -> Views:
+        images, extrinsics, intrinsics = (field[part] for field in (views.images, views.extrinsics, views.intrinsics))
+        return Views(views.names[part], images, extrinsics, intrinsics, views.cameras[part])
 
-    sources = chosen[: len(context)]
-    truth = None if depth is None else np.stack([_fitted_depth(depth, *frame, height, width) for frame in sources])
-    name = "+".join(path.stem for path, _ in sources)
-    return Case(name, posed(slice(len(context))), posed(slice(len(context), None)), depth=truth)
+    def posed(part: Views, valid: np.ndarray) -> Posed:
+        return Posed(part.names, part.images, part.extrinsics, part.intrinsics, valid)
+
+    count = len(context)
+    given, held_out = taken(slice(count)), taken(slice(count, None))
+    found = find_range(given)
+    truth = None if depth is None else np.stack([_fitted_depth(depth, *frame, *size) for frame in chosen[:count]])
+    name = "+".join(path.stem for path, _ in chosen[:count])
+    return Case(name, posed(given, valid[:count]), posed(held_out, valid[count:]), found.near, found.far, truth)
 
 
 def _number(frames: Sequence[Frame], name: str, option: str) -> int:
