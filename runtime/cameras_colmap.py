@@ -66,7 +66,7 @@ def read(path: Path, pictures: Sequence[Path] = ()) -> list[Camera]:
     cameras = []
     for image in _read_apart(models[0]):
         with located(image["name"]):
-            cameras.append(_camera(image))
+            cameras.append(to_camera(image))
     return cameras
 
 
@@ -86,7 +86,7 @@ def _is_model(folder: Path) -> bool:
 
 
 def _read_apart(model: Path) -> list[dict[str, Any]]:
-    """What `_images` finds, through a process that may fail in any way."""
+    """What `describe` finds, through a process that may fail in any way."""
     if importlib.util.find_spec("pycolmap") is None:
         raise InputError(f"is a COLMAP model, for which pycolmap is needed; {INSTALL}")
     files = [file for file in model.iterdir() if file.suffix in SUFFIXES]
@@ -118,7 +118,8 @@ def _check_counts(files: Sequence[Path]) -> None:
                 )
 
 
-def _camera(image: dict[str, Any]) -> Camera:
+def to_camera(image: dict[str, Any]) -> Camera:
+    """The camera of an image as `describe` gives it; raises InputError for a lens that is not ours."""
     model = image["model"]
     fields = PERSPECTIVE.get(model) or FISHEYE.get(model)
     if fields is None:
@@ -144,14 +145,11 @@ def _camera(image: dict[str, Any]) -> Camera:
     )
 
 
-# ---- in a process of its own
+# ---- what the library holds; from a file, in a process of its own
 
 
-def _images(model: str) -> list[dict[str, Any]]:
-    """The registered images of a model, with plain values, by name."""
-    import pycolmap
-
-    reconstruction = pycolmap.Reconstruction(model)
+def describe(reconstruction: "pycolmap.Reconstruction") -> list[dict[str, Any]]:
+    """The registered images of a model, in plain values as `to_camera` takes them, by name."""
     images = [image for image in reconstruction.images.values() if image.has_pose]
     found = []
     for image in sorted(images, key=lambda image: image.name):
@@ -164,21 +162,19 @@ def _images(model: str) -> list[dict[str, Any]]:
                 "height": camera.height,
                 "parameters": camera.params.tolist(),
                 "cam_from_world": image.cam_from_world().matrix().tolist(),  # [3, 4]
-                "depth_range": depth_range(reconstruction, image),
+                "depth_range": range_of_depths(observed_depths(reconstruction, image)),
             }
         )
     return found
 
 
-def depth_range(reconstruction: "pycolmap.Reconstruction", image: "pycolmap.Image") -> tuple[float, float] | None:
-    """Near and far from the points that an image observes, or None if there are too few."""
+def observed_depths(reconstruction: "pycolmap.Reconstruction", image: "pycolmap.Image") -> np.ndarray:
+    """Depths of the points that an image observes, or of some of them, [points]."""
     observed = [point.point3D_id for point in image.get_observation_points2D()]
     observed = observed[:: max(1, len(observed) // DEPTHS_USED)]
-    if not observed:
-        return None
-    points = np.array([reconstruction.point3D(identity).xyz for identity in observed])  # [points, 3]
-    depth = points @ image.cam_from_world().matrix()[2, :3] + image.cam_from_world().matrix()[2, 3]
-    return range_of_depths(depth)
+    points = np.array([reconstruction.point3D(identity).xyz for identity in observed]).reshape(-1, 3)
+    matrix = image.cam_from_world().matrix()  # [3, 4]
+    return points @ matrix[2, :3] + matrix[2, 3]
 
 
 def _limit_memory(limit: int) -> None:
@@ -192,6 +188,8 @@ def _limit_memory(limit: int) -> None:
 if __name__ == "__main__":
     _limit_memory(int(sys.argv[2]))
     try:
-        print(json.dumps(_images(sys.argv[1])))
+        import pycolmap
+
+        print(json.dumps(describe(pycolmap.Reconstruction(sys.argv[1]))))
     except Exception as error:  # whatever the library raises is a damaged model
         sys.exit(" ".join(str(error).split()))

@@ -19,7 +19,7 @@ TINY = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """places: pixels [features, 2]. descriptors: root-normalised SIFT, float32 [features, 128]."""
+    """places: pixels [features, 2]. descriptors: roots of SIFT's shares, of length 1, float32 [features, 128]."""
 
     places: np.ndarray
     descriptors: np.ndarray
@@ -41,15 +41,15 @@ def match_features(first: Features, second: Features) -> np.ndarray:
     """Pairs of indices [matches, 2]: features that are each other's nearest, clearly nearer than the next."""
     if min(len(first.places), len(second.places)) < 2:
         return np.zeros((0, 2), int)
-    forth = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first.descriptors, second.descriptors, k=2)
-    back = cv2.BFMatcher(cv2.NORM_L2).match(second.descriptors, first.descriptors)
-    nearest = {match.queryIdx: match.trainIdx for match in back}
-    pairs = [
-        (best.queryIdx, best.trainIdx)
-        for best, next_best in forth
-        if best.distance < DISTINCT * next_best.distance and nearest[best.trainIdx] == best.queryIdx
-    ]
-    return np.array(pairs, int).reshape(-1, 2)
+    # Descriptors have length 1: one minus the likeness is half the squared distance.
+    likeness = first.descriptors @ second.descriptors.T  # [first, second]
+    forth, back = likeness.argmax(axis=1), likeness.argmax(axis=0)
+    rows = np.arange(len(forth))
+    best = likeness[rows, forth]
+    likeness[rows, forth] = -1
+    next_best = likeness.max(axis=1)
+    good = (back[forth] == rows) & (1 - best < DISTINCT**2 * (1 - next_best))
+    return np.stack([rows, forth], axis=1)[good]
 
 
 def rays_of(places: np.ndarray, K: np.ndarray) -> np.ndarray:
@@ -57,7 +57,9 @@ def rays_of(places: np.ndarray, K: np.ndarray) -> np.ndarray:
     return (places - K[:2, 2]) / np.diag(K)[:2]
 
 
-def epipolar_error(first: np.ndarray, second: np.ndarray, second_from_first: np.ndarray) -> np.ndarray:
+def epipolar_error(
+    first: np.ndarray, second: np.ndarray, second_from_first: np.ndarray, signed: bool = False
+) -> np.ndarray:
     """How far two rays, both [points, 2], are from meeting: Sampson's distance [points], on the plane z = 1.
 
     second_from_first: what takes points from the first camera's frame to the second's, [4, 4].
@@ -69,7 +71,8 @@ def epipolar_error(first: np.ndarray, second: np.ndarray, second_from_first: np.
     lines_back = np.hstack([second, ones]) @ essential
     residual = (np.hstack([second, ones]) * lines).sum(axis=1)
     slope = (lines[:, :2] ** 2).sum(axis=1) + (lines_back[:, :2] ** 2).sum(axis=1)
-    return np.abs(residual) / np.sqrt(np.maximum(slope, TINY))
+    error = residual / np.sqrt(np.maximum(slope, TINY))
+    return error if signed else np.abs(error)
 
 
 def triangulate(first: np.ndarray, second: np.ndarray, second_from_first: np.ndarray) -> np.ndarray:

@@ -1,0 +1,142 @@
+"""Photographs without cameras: what `--cameras estimate` does.
+
+Two photographs take OpenCV: SIFT, the essential matrix, triangulation; their lenses are taken to have no distortion and
+their axis in the middle of the picture. More take COLMAP's mapper. The world is the first photograph's camera, and its
+unit the median depth of the points that were found, since photographs know no unit.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from .camera_fields import calibration
+from .cameras import Camera, invert_rigid
+from .errors import InputError
+from .focal_length import exif_focal, given_focal
+from .images import load_image
+from .matching import Features, find_features, match_features, rays_of
+from .progress import with_progress
+from .sparse_depth import range_of_depths
+from .two_view import TwoViews, estimate_pose, explained_by_turning
+
+LONGEST_SIDE = 1600  # pixels, in which features are looked for
+PIXELS_OFF = 1.5  # at that size: how far from its epipolar line a match may lie
+FEWEST_MATCHES = 40
+MOST_BY_TURNING = 0.7  # of the matches may be explained by a camera that only turned
+LEAST_SHARE = 0.3  # of the matches must agree
+LEAST_PARALLAX_DEG = 1.5  # below, the direction from one camera to the other is mostly noise
+
+
+@dataclass(frozen=True, eq=False)
+class Photograph:
+    """A photograph before its camera is known. features: in pixels of its own size; focal: pixels, if known."""
+
+    path: Path
+    width: int
+    height: int
+    features: Features
+    focal: float | None
+
+
+def estimate_cameras(pictures: Sequence[Path], focal: str | None = None) -> list[Camera]:
+    """Cameras for photographs of one scene that does not move; of more than two, those that could be placed.
+
+    focal: the focal length of all, in pixels (`1375`) or on 35 mm film (`26mm`); else each one's EXIF data tells, and
+    with more than two photographs it is found where neither does.
+    The first camera is the world's origin, the median depth of what is seen is 1, and `depth_range` is set.
+    Raises InputError for fewer than two photographs, two without focal length, too few common points, too little
+    parallax, more than two photographs without pycolmap, or where nothing fits together.
+    """
+    if len(pictures) < 2:
+        raise InputError(
+            f"--cameras estimate: {len(pictures)} photograph given, expected two at least; add photographs"
+        )
+    if len(pictures) > 2:
+        from .mapping import check_mapper, place_photographs
+
+        check_mapper(len(pictures))
+        photographs = [_see(picture, focal) for picture in with_progress(pictures, "finding features")]
+        return _in_unit(*place_photographs(photographs, refine_focal=focal is None))
+    return _in_unit(*_two_cameras(_see(pictures[0], focal), _see(pictures[1], focal)))
+
+
+def _see(picture: Path, focal: str | None) -> Photograph:
+    image = load_image(picture)
+    height, width = image.shape[:2]
+    scale = min(1.0, LONGEST_SIDE / max(height, width))
+    small = cv2.resize(image, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA)
+    features = find_features(small)
+    places = features.places * (width / small.shape[1], height / small.shape[0])
+    known = exif_focal(picture, width, height) if focal is None else given_focal(focal, width, height)
+    return Photograph(picture, width, height, Features(places, features.descriptors), known)
+
+
+def _two_cameras(first: Photograph, second: Photograph) -> tuple[list[Camera], np.ndarray]:
+    """The cameras of two photographs, and the depths of what both see."""
+    Ks = [pinhole(photograph) for photograph in (first, second)]
+    pair = f"{first.path} and {second.path}"
+    matches = match_features(first.features, second.features)
+    if len(matches) < FEWEST_MATCHES:
+        raise InputError(
+            f"{pair}: {len(matches)} points found in both, expected {FEWEST_MATCHES} at least; "
+            "give photographs that show more of the same, sharp and with texture"
+        )
+    first_rays = rays_of(first.features.places[matches[:, 0]], Ks[0])
+    second_rays = rays_of(second.features.places[matches[:, 1]], Ks[1])
+    tolerance = PIXELS_OFF * max(1.0, max(first.width, first.height) / LONGEST_SIDE) / Ks[0][0, 0]
+    if explained_by_turning(first_rays, second_rays, tolerance) > MOST_BY_TURNING:
+        raise _same_place(pair, 0.0)
+    found = _checked(estimate_pose(first_rays, second_rays, tolerance), pair, len(matches))
+    extrinsics = invert_rigid(found.second_from_first)
+    depths = found.points[:, 2], found.points @ found.second_from_first[2, :3] + found.second_from_first[2, 3]
+    cameras = [
+        Camera(str(photograph.path), photograph.width, photograph.height, K, pose, depth_range=range_of_depths(depth))
+        for photograph, K, pose, depth in zip((first, second), Ks, (np.eye(4), extrinsics), depths, strict=True)
+    ]
+    return cameras, np.concatenate(depths)
+
+
+def pinhole(photograph: Photograph) -> np.ndarray:
+    """K [3, 3] with the axis in the middle; raises InputError where the focal length is not known."""
+    if photograph.focal is None:
+        raise InputError(
+            f"{photograph.path}: its EXIF data tells no focal length; give --focal, in pixels or as on 35 mm film "
+            "(a phone's main camera is about 26mm)"
+        )
+    return calibration(photograph.focal, photograph.focal, photograph.width / 2, photograph.height / 2)
+
+
+def _checked(found: TwoViews | None, pair: str, matches: int) -> TwoViews:
+    """The relative pose; raises InputError where it rests on too little."""
+    fits = 0 if found is None else int(found.fits.sum())
+    if found is None or fits < max(FEWEST_MATCHES, matches * LEAST_SHARE):
+        raise InputError(
+            f"{pair}: {fits} of {matches} points found in both fit one scene that does not move, expected "
+            f"{max(FEWEST_MATCHES, round(matches * LEAST_SHARE))} at least; check --focal, or give other photographs"
+        )
+    if found.parallax_deg < LEAST_PARALLAX_DEG:
+        raise _same_place(pair, found.parallax_deg)
+    return found
+
+
+def _same_place(pair: str, parallax_deg: float) -> InputError:
+    return InputError(
+        f"{pair}: were taken from too nearly the same place: sights of the same point are {parallax_deg:.2g} degrees "
+        f"apart, expected {LEAST_PARALLAX_DEG} at least; step aside by a twentieth of the scene's distance"
+    )
+
+
+def _in_unit(cameras: Sequence[Camera], depths: np.ndarray) -> list[Camera]:
+    """The cameras in the first one's frame, in the unit in which the median of `depths` is 1."""
+    scale = 1 / float(np.median(depths))
+    to_first = invert_rigid(cameras[0].extrinsics)
+    moved = []
+    for camera in cameras:
+        extrinsics = to_first @ camera.extrinsics
+        extrinsics[:3, 3] *= scale
+        depth_range = camera.depth_range and (camera.depth_range[0] * scale, camera.depth_range[1] * scale)
+        moved.append(replace(camera, extrinsics=extrinsics, depth_range=depth_range))
+    return moved
