@@ -1,11 +1,13 @@
 """ONNX Runtime sessions: providers checked, threads and memory set from measurement."""
 
+import os
 from pathlib import Path
 
 import numpy as np
 import onnxruntime
 
 from .errors import InputError
+from .graph_cache import place_for
 
 CPU = "CPUExecutionProvider"
 ERRORS_ONLY = 3
@@ -23,20 +25,23 @@ def provider_name(provider: str) -> str:
     raise InputError(f"execution provider {provider} is not installed; this ONNX Runtime offers {offered}")
 
 
-def open_session(model: Path | bytes, provider: str = CPU) -> onnxruntime.InferenceSession:
+def open_session(
+    model: Path | bytes, provider: str = CPU, threads: int | None = None, profile: Path | None = None
+) -> onnxruntime.InferenceSession:
     """Load a graph on one execution provider.
 
-    provider: a full name, as `provider_name` gives it. Raises InputError if the file cannot be loaded, or if ONNX
-    Runtime silently fell back to another provider.
+    provider: a full name, as `provider_name` gives it. threads: all that the process may use, where not given.
+    profile: beginning of the name of a file in which ONNX Runtime notes the times of all operators.
+    A file's optimised graph is kept for the next time where the provider is the CPU (see `graph_cache`).
+    Raises InputError if the file cannot be loaded, or if ONNX Runtime silently fell back to another provider.
     """
-    options = onnxruntime.SessionOptions()
-    options.log_severity_level = ERRORS_ONLY
-    # Its planning is quadratic in the number of nodes: without it a session opens ten times faster, and a run takes
-    # neither longer nor more memory, because the arena reuses buffers all the same.
-    options.enable_mem_reuse = False
-    source = model if isinstance(model, bytes) else str(model)
+    options = _options(threads, profile)
+    if provider == CPU and isinstance(model, Path):
+        cached = _open_cached(model, options)
+        if cached is not None:
+            return cached
     try:
-        session = onnxruntime.InferenceSession(source, options, providers=[provider])
+        session = _create(model, options, provider)
     except Exception as error:  # ONNX Runtime raises many kinds, all derived from Exception alone
         reason = str(error).split(" : ")[-1].splitlines()[0]
         where = "the model" if isinstance(model, bytes) else model
@@ -49,6 +54,60 @@ def open_session(model: Path | bytes, provider: str = CPU) -> onnxruntime.Infere
             "its libraries are missing or do not fit, or choose another --provider"
         )
     return session
+
+
+def usable_cores() -> int:
+    """How many processor cores this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _options(threads: int | None, profile: Path | None) -> onnxruntime.SessionOptions:
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = ERRORS_ONLY
+    # Its planning is quadratic in the number of nodes: without it a session opens ten times faster, and a run takes
+    # neither longer nor more memory, because the arena reuses buffers all the same.
+    options.enable_mem_reuse = False
+    # Left alone, ONNX Runtime 1.31 pins a thread to every core, also to those that the process was told to keep off.
+    if threads is None and usable_cores() < (os.cpu_count() or 1):
+        threads = usable_cores()
+    options.intra_op_num_threads = threads or 0
+    if profile is not None:
+        options.enable_profiling, options.profile_file_prefix = True, str(profile)
+    return options
+
+
+def _create(
+    model: Path | bytes, options: onnxruntime.SessionOptions, provider: str = CPU
+) -> onnxruntime.InferenceSession:
+    source = model if isinstance(model, bytes) else str(model)
+    return onnxruntime.InferenceSession(source, options, providers=[provider])
+
+
+def _open_cached(model: Path, options: onnxruntime.SessionOptions) -> onnxruntime.InferenceSession | None:
+    """A session of the optimised graph, which is kept if it was not yet; None where that does not work out."""
+    place = place_for(model)
+    if place is None:
+        return None
+
+    def optimise(kept: Path) -> onnxruntime.InferenceSession:
+        options.optimized_model_filepath = str(kept)
+        return _create(model, options)
+
+    found = place.find()
+    try:
+        if found is None:
+            return place.fill(optimise)
+        options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+        return _create(found, options)
+    except Exception:  # a damaged model, a full disk: opening the model itself says what is wrong, if anything is
+        if found is not None:
+            place.forget(found)
+        return None
+    finally:
+        options.optimized_model_filepath = ""
+        options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_ALL
 
 
 def run_session(session: onnxruntime.InferenceSession, feeds: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -1,5 +1,6 @@
 """A network of a tenth of the parameters, exported once, and photographs of a scene, drawn once."""
 
+import os
 import sys
 from pathlib import Path
 
@@ -52,6 +53,18 @@ def run_command(main, *arguments) -> int:
     finally:
         sys.argv = before
     return 0
+
+
+@pytest.fixture(scope="session", autouse=True)
+def own_cache(tmp_path_factory):
+    """Keep the user's cache folder out of it."""
+    before = os.environ.get("XDG_CACHE_HOME")
+    os.environ["XDG_CACHE_HOME"] = str(tmp_path_factory.mktemp("cache"))
+    yield
+    if before is None:
+        del os.environ["XDG_CACHE_HOME"]
+    else:
+        os.environ["XDG_CACHE_HOME"] = before
 
 
 @pytest.fixture(scope="session")
