@@ -13,7 +13,7 @@ from .cameras import Camera
 from .cameras_colmap import INSTALL, describe, observed_depths, to_camera
 from .errors import InputError
 from .matching import match_features
-from .progress import with_progress
+from .progress import progress
 
 if TYPE_CHECKING:
     import pycolmap
@@ -82,7 +82,7 @@ def _fill(database_path: Path, photographs: "Sequence[Photograph]") -> None:
             image = pycolmap.Image(name=_name(index), camera_id=camera_of[kind])
             images.append(database.write_image(image))
             database.write_keypoints(images[-1], photograph.features.places.astype(np.float32))
-        for i, j in with_progress(_pairs(len(photographs)), "matching photographs"):
+        for i, j in progress(_pairs(len(photographs)), "matching photographs"):
             matches = match_features(photographs[i].features, photographs[j].features)
             if len(matches) >= FEWEST_MATCHES:
                 database.write_matches(images[i], images[j], matches.astype(np.uint32))

@@ -7,7 +7,7 @@ from typing import TypeVar
 T = TypeVar("T")
 
 
-def with_progress(items: Sequence[T], doing: str) -> Iterable[T]:
+def progress(items: Sequence[T], doing: str) -> Iterable[T]:
     """The items, with a bar that says what is being done with them."""
     from rich.console import Console
     from rich.progress import track
