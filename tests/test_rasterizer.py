@@ -1,5 +1,9 @@
-"""The rasteriser against gsplat's reference images, and against a slow twin that says plainly what it computes."""
+"""The rasteriser against gsplat's reference images, and against a slow twin that says plainly what it computes.
 
+What it draws is asked of both ways in which it draws: with NumPy, and compiled by numba.
+"""
+
+import os
 import subprocess
 import sys
 import time
@@ -9,21 +13,44 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from idesplat.runtime import rasterizer, rasterizer_compiled
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.rasterizer import Rendering, rasterize
 
 DATA = Path(__file__).parent / "data"
+STEPS = {
+    "numpy": (rasterizer._project, rasterizer._draw_band),
+    "compiled": (rasterizer_compiled.project, rasterizer_compiled.draw_band),
+}
 
 
+def use_steps(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.setattr(rasterizer, "_steps", lambda: STEPS[name])
+
+
+@pytest.fixture(params=STEPS)
+def steps(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Draw with NumPy, then compiled."""
+    use_steps(monkeypatch, request.param)
+    return request.param
+
+
+def reference_case(case: str) -> tuple:
+    """A reference scene as the arguments of `rasterize`."""
+    with np.load(DATA / f"raster-{case}" / "reference.npz") as file:
+        arrays = [file[name] for name in ("means", "quats", "scales", "opacities", "sh", "viewmat", "K")]
+        return *arrays, int(file["width"]), int(file["height"]), file["background"]
+
+
+def test_numba_is_used_where_it_is_installed() -> None:
+    assert rasterizer._steps() == STEPS["compiled"]
+
+
+@pytest.mark.usefixtures("steps")
 @pytest.mark.parametrize("case", ["random", "feedforward"])
 def test_matches_gsplat(case: str) -> None:
     reference = np.load(DATA / f"raster-{case}" / "reference.npz")
-    drawn = rasterize(
-        *(reference[name] for name in ("means", "quats", "scales", "opacities", "sh", "viewmat", "K")),
-        int(reference["width"]),
-        int(reference["height"]),
-        reference["background"],
-    )
+    drawn = rasterize(*reference_case(case))
     for name in Rendering._fields:
         ours, theirs = getattr(drawn, name), reference[name]
         assert ours.dtype == np.float32
@@ -33,6 +60,51 @@ def test_matches_gsplat(case: str) -> None:
         assert 10 * np.log10(1 / np.mean(error**2)) >= 110, name  # dB; rounding to float32 leaves 130 to 150
 
 
+@pytest.mark.parametrize("case", ["random", "feedforward", *range(24)])
+def test_compiled_matches_numpy(case: str | int, monkeypatch: pytest.MonkeyPatch) -> None:
+    if isinstance(case, str):
+        scene = reference_case(case)
+    else:
+        scene = random_scene(np.random.default_rng(1000 + case), splats=500, degree=case % 4)
+    use_steps(monkeypatch, "numpy")
+    expected = rasterize(*scene)
+    use_steps(monkeypatch, "compiled")
+    drawn = rasterize(*scene)
+    for name in Rendering._fields:
+        theirs = getattr(expected, name)
+        # Depth is in scene units, so its rounding grows with it; the others reach 1.
+        np.testing.assert_allclose(getattr(drawn, name), theirs, rtol=0, atol=1e-5 * max(1, theirs.max()), err_msg=name)
+
+
+@pytest.mark.parametrize(
+    "numba",
+    [
+        pytest.param("raise ImportError('not installed')", id="not installed"),
+        pytest.param("def njit(**options): raise RuntimeError('no locator available')", id="nowhere to cache"),
+    ],
+)
+def test_draws_where_nothing_can_be_compiled(numba: str, tmp_path: Path) -> None:
+    (tmp_path / "numba.py").write_text(numba)
+    program = (
+        "from idesplat.runtime import rasterizer\n"
+        "import numpy as np\n"
+        "g = np.zeros((1, 3)) + [0, 0, 2], np.ones((1, 4)), np.ones((1, 3)), np.ones(1), np.zeros((1, 1, 3))\n"
+        "drawn = rasterizer.rasterize(*g, np.eye(4), np.diag([8.0, 8.0, 1.0]), 8, 8)\n"
+        "assert drawn.alpha[0, 0] > 0.9 and rasterizer._steps()[0] is rasterizer._project\n"
+    )
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+    subprocess.run([sys.executable, "-c", program], check=True, env=environment, timeout=60)
+
+
+def test_depths_are_sorted_as_numpy_sorts_them() -> None:
+    rng = np.random.default_rng(0)
+    depth = np.repeat(np.exp(rng.uniform(-80, 80, 500)).astype(np.float32), 3)
+    rng.shuffle(depth)
+    np.testing.assert_array_equal(rasterizer._nearest_first(depth), np.argsort(depth, kind="stable"))
+    assert len(rasterizer._nearest_first(depth[:0])) == 0
+
+
+@pytest.mark.usefixtures("steps")
 @pytest.mark.parametrize("seed", range(24))
 def test_matches_slow_twin(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -46,6 +118,7 @@ def test_matches_slow_twin(seed: int) -> None:
 
 def test_many_chunks_give_what_one_gives(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pixels carry their transmittance from chunk to chunk, and stay closed once opaque."""
+    use_steps(monkeypatch, "numpy")
     scene = random_scene(np.random.default_rng(5), splats=400, degree=1)
     whole = rasterize(*scene)
     assert whole.alpha.max() > 0.999
@@ -56,6 +129,7 @@ def test_many_chunks_give_what_one_gives(monkeypatch: pytest.MonkeyPatch) -> Non
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=5e-5)
 
 
+@pytest.mark.usefixtures("steps")
 def test_nothing_to_draw_shows_the_background() -> None:
     empty = gaussians_at(np.zeros((0, 3)))
     behind = gaussians_at(np.array([[0, 0, -2.0], [0.1, 0, -0.5], [0, 0, 0.005]]))
@@ -68,6 +142,7 @@ def test_nothing_to_draw_shows_the_background() -> None:
         assert not depth.any()
 
 
+@pytest.mark.usefixtures("steps")
 def test_one_opaque_splat_worked_by_hand() -> None:
     """A splat at depth 2 over the centre of pixel (row 3, column 5): alpha is clamped at 0.99 there."""
     K = np.array([[10.0, 0, 5.5], [0, 10.0, 3.5], [0, 0, 1]])
@@ -80,6 +155,7 @@ def test_one_opaque_splat_worked_by_hand() -> None:
     assert alpha[3, 7] == pytest.approx(exp(-0.5 * 2**2 / variance), rel=1e-5)
 
 
+@pytest.mark.usefixtures("steps")
 def test_the_third_opaque_splat_is_dropped() -> None:
     """Two splats at the clamp leave 0.01^2 of the light, in doubles a hair more than 1e-4; a third would leave 1e-6."""
     means, quats, scales, _, sh = gaussians_at(np.array([[0, 0, 2.0], [0, 0, 3.0], [0, 0, 4.0]]))
@@ -89,6 +165,7 @@ def test_the_third_opaque_splat_is_dropped() -> None:
     assert depth[0, 0] == pytest.approx(0.99 * 2 + 0.0099 * 3, abs=1e-6)
 
 
+@pytest.mark.usefixtures("steps")
 def test_near_plane_is_the_callers() -> None:
     gaussians = gaussians_at(np.array([[0, 0, 0.1]]))
     camera = (np.eye(4), pinhole(8, 8), 8, 8)
@@ -96,6 +173,7 @@ def test_near_plane_is_the_callers() -> None:
     assert not rasterize(*gaussians, *camera, near=0.2).alpha.any()
 
 
+@pytest.mark.usefixtures("steps")
 def test_needles_and_extremes_stay_finite() -> None:
     rng = np.random.default_rng(1)
     means = rng.normal(size=(60, 3)) * [1, 1, 0.01] + [0, 0, 0.02]
@@ -112,6 +190,7 @@ def test_needles_and_extremes_stay_finite() -> None:
     assert drawn.alpha.max() <= 1
 
 
+@pytest.mark.usefixtures("steps")
 def test_memory_does_not_grow_with_overdraw() -> None:
     """300 veils over the whole image are 23 million fragments; at some 60 bytes each they would take 1.4 GB at once."""
     means, quats, _, _, sh = gaussians_at(np.random.default_rng(0).normal(size=(300, 3)) * 0.01 + [0, 0, 5])
