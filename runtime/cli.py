@@ -210,9 +210,9 @@ def _write_renders(prediction: "Prediction", views: "Views", stems: list[str], f
     from rich.console import Console
     from rich.progress import track
 
+    from .drawing import draw_view
     from .images_out import save_png
     from .paths import interpolate_extrinsics
-    from .render import draw_view
 
     height, width = prediction.depth.shape[1:]
     K = views.intrinsics.astype(np.float64) * np.array([width, height, 1.0])[:, None]  # [views, 3, 3]

@@ -16,7 +16,7 @@ def save_png(path: Path, rgb: np.ndarray) -> None:
     """
     import cv2  # here, so that a command can say what it does without loading OpenCV
 
-    _, encoded = cv2.imencode(".png", _to_bytes(rgb)[..., ::-1])
+    _, encoded = cv2.imencode(".png", to_bytes(rgb)[..., ::-1])
     with replacing(path) as temporary:
         temporary.write_bytes(encoded.data)
 
@@ -29,22 +29,34 @@ def save_depth_png(path: Path, depth: np.ndarray) -> None:
     save_png(path, depth_colours(depth))
 
 
-def depth_colours(depth: np.ndarray) -> np.ndarray:
+def depth_colours(depth: np.ndarray, ends: tuple[float, float] | None = None) -> np.ndarray:
     """Depth in world units, [height, width], as RGB in [0, 1] from blue (far) to red (near), by inverse depth.
 
-    The nearest and farthest 2 % share the end colours. Depth that is not positive and finite becomes black.
+    ends: the inverse depths that are quite blue and quite red; the map's own `depth_ends` if not given. What lies
+    beyond has their colours. Depth that is not positive and finite becomes black.
     """
     import cv2
 
-    known = np.isfinite(depth) & (depth > 0)
+    known = _known(depth)
     inverse_depth = 1 / np.where(known, depth, 1)
-    far, near = np.percentile(inverse_depth[known], (FARTHEST_SHARE, NEAREST_SHARE)) if known.any() else (0, 1)
+    far, near = depth_ends(depth) if ends is None else ends
     warmth = (inverse_depth - far) / (near - far) if near > far else np.full(depth.shape, 0.5)
-    picture = cv2.applyColorMap(_to_bytes(warmth), cv2.COLORMAP_TURBO)
+    picture = cv2.applyColorMap(to_bytes(warmth), cv2.COLORMAP_TURBO)
     picture[~known] = 0
     return picture[..., ::-1].astype(np.float32) / 255
 
 
-def _to_bytes(values: np.ndarray) -> np.ndarray:
+def depth_ends(depth: np.ndarray) -> tuple[float, float]:
+    """Inverse depths, of the far and the near end, beyond which 2 % of a depth map lie each."""
+    known = _known(depth)
+    far, near = np.percentile(1 / depth[known], (FARTHEST_SHARE, NEAREST_SHARE)) if known.any() else (0.0, 1.0)
+    return float(far), float(near)
+
+
+def _known(depth: np.ndarray) -> np.ndarray:
+    return np.isfinite(depth) & (depth > 0)
+
+
+def to_bytes(values: np.ndarray) -> np.ndarray:
     """Numbers in [0, 1] as uint8, rounded."""
     return np.rint(np.clip(values, 0, 1) * 255).astype(np.uint8)

@@ -43,3 +43,23 @@ def _catmull_rom(points: np.ndarray, leg: int, share: float) -> np.ndarray:
         + share**2 * (3 * (end - start) - 2 * leaving - arriving)
         + share**3 * (2 * (start - end) + leaving + arriving)
     )
+
+
+def orbit_extrinsics(start: np.ndarray, pivot: np.ndarray, axis: np.ndarray, degrees: float, frames: int) -> np.ndarray:
+    """Poses [frames, 4, 4] of a camera carried around an axis [3] through the pivot [3], beginning at `start` [4, 4].
+
+    By 360 degrees it goes all the way round; by fewer it swings as far as half of them to either side and comes back.
+    Either way the first frame could follow the last. Raises InputError if there is no frame or no angle.
+    """
+    import cv2
+
+    if frames < 1 or not 0 < degrees <= 360:
+        raise InputError(f"an orbit of {frames} frames over {degrees:g} degrees; expected one frame, 0 to 360 degrees")
+    turns = np.arange(frames) / frames
+    angles = np.radians(degrees * turns if degrees == 360 else degrees / 2 * np.sin(2 * np.pi * turns))
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    for pose, angle in zip(poses, angles, strict=True):
+        turn = cv2.Rodrigues(angle * axis / np.linalg.norm(axis))[0]
+        pose[:3, :3] = turn @ start[:3, :3]
+        pose[:3, 3] = pivot + turn @ (start[:3, 3] - pivot)
+    return poses

@@ -1,83 +1,82 @@
-"""The command idesplat-render: a splat file and cameras to pictures."""
+"""The command idesplat-render: a splat file to pictures or a video."""
 
-import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path, PurePosixPath
 from typing import Annotated
 
 import numpy as np
 import typer
 
-from .cameras import Camera, read_cameras
+from .cameras import Camera, CameraFormat, read_cameras
+from .drawing import BLACK, draw_view
 from .errors import InputError, exit_on_input_error
-from .files import make_folder
+from .files import check_writable, make_folder, replacing
 from .formats import read_scene
 from .gaussians import Gaussians
-from .images_out import save_png
-from .rasterizer import Rendering, rasterize
+from .images_out import depth_colours, depth_ends, save_png
+from .progress import progress
+from .rasterizer import Rendering
+from .shots import FULL_TURN, SWING, along_path, around, fitted, overview
+from .sizes import parse_size
+from .video_out import open_video
 
-BLACK = (0.0, 0.0, 0.0)
-
-
-def draw_view(
-    gaussians: Gaussians,
-    extrinsics: np.ndarray,  # [4, 4]
-    K: np.ndarray,  # [3, 3]
-    width: int,
-    height: int,
-    background: tuple[float, float, float] = BLACK,
-) -> Rendering:
-    """Draw Gaussians from a camera given as the rest of the package has it: camera-to-world, K in pixels.
-
-    Raises InputError as `rasterize` does.
-    """
-    return rasterize(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.sh,
-        world_to_camera(extrinsics),
-        K,
-        width,
-        height,
-        background,
-    )
-
-
-def world_to_camera(extrinsics: np.ndarray) -> np.ndarray:
-    """The viewmat [4, 4] of a rigid camera-to-world pose [4, 4]."""
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = extrinsics[:3, :3].T
-    viewmat[:3, 3] = -extrinsics[:3, :3].T @ extrinsics[:3, 3]
-    return viewmat
+VIDEO, PICTURE = ".mp4", ".png"
+COLOUR, DEPTH, ALPHA = "", "-depth", "-alpha"  # what a picture shows, as its name ends
+SOLID = 0.5  # alpha from which on a pixel has a depth
+SIZE = "360x640"  # where neither cameras nor --size say so
 
 
 @exit_on_input_error
 def render(
     scene: Annotated[Path, typer.Argument(help="Splat file of any format.", show_default=False)],
-    cameras: Annotated[Path, typer.Option(help="Cameras, such as a transforms.json.", show_default=False)],
-    out: Annotated[Path, typer.Option(help="Folder for the pictures.", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Folder for pictures, one .png, or one .mp4.", show_default=False)],
+    cameras: Annotated[Path | None, typer.Option(help="Cameras, such as a transforms.json.")] = None,
+    camera_format: Annotated[
+        CameraFormat | None, typer.Option(help="What --cameras is, where that is not recognised.")
+    ] = None,
+    orbit: Annotated[bool, typer.Option("--orbit", help="Go around the scene.")] = False,
+    path: Annotated[bool, typer.Option("--path", help="Go smoothly through the cameras.")] = False,
+    degrees: Annotated[
+        float | None, typer.Option(help="Of the orbit: 360 by default, with cameras a swing of 30.", show_default=False)
+    ] = None,
+    frames: Annotated[int, typer.Option(help="How many pictures --orbit and --path make.", min=1)] = 90,
+    fps: Annotated[float, typer.Option(help="Frames a second of an .mp4.")] = 30,
+    size: Annotated[
+        str | None, typer.Option(help=f"HEIGHTxWIDTH: the cameras' by default, or {SIZE}.", show_default=False)
+    ] = None,
+    depth: Annotated[bool, typer.Option("--depth", help="Draw depth, too (colours, and metric .npz).")] = False,
+    alpha: Annotated[bool, typer.Option("--alpha", help="Draw opacity, too.")] = False,
     background: Annotated[
         tuple[float, float, float], typer.Option(help="Red, green and blue behind the scene, 0 to 1.")
     ] = BLACK,
 ) -> None:
-    """Draw a splat file as each of the cameras sees it: one PNG a camera, named after its image.
+    """Draw a splat file as the cameras see it, on a path through them, in an orbit, or from where all of it is seen.
 
-    Pictures have the camera's own size. They show the ideal pinhole view: where a camera has lens distortion, compare
-    with the undistorted photograph.
+    Pictures are named after the cameras' images and have the cameras' own size. They show the ideal pinhole view: where
+    a camera has lens distortion, compare with the undistorted photograph.
     """
     if not all(0 <= value <= 1 for value in background):
         raise InputError(f"--background is {background}, expected red, green and blue from 0 to 1")
-    views = read_cameras(cameras)
-    targets = _targets(views, cameras.parent, out)
+    if not 0 < fps <= 1000:
+        raise InputError(f"--fps {fps:g}: expected frames a second, 1 to 1000")
+    if path and orbit:
+        raise InputError("--path and --orbit: expected one of them")
+    views = read_cameras(cameras, form=camera_format) if cameras else []
+    if path and not views:
+        raise InputError("--path: needs the cameras that it leads through; give --cameras, or use --orbit")
     gaussians = read_scene(scene)
-    make_folder(out)
-    for view, target in _with_progress(list(zip(views, targets, strict=True))):
-        save_png(target, draw_view(gaussians, view.extrinsics, view.K, view.width, view.height, background).rgb)
-    for target in targets:
-        print(target)
-    print(f"{len(gaussians)} Gaussians drawn in {len(targets)} pictures; open {out} in any image viewer")
+    shots = _shots(gaussians, views, orbit, path, degrees, frames, size)
+    kinds = [COLOUR, *[DEPTH] * depth, *[ALPHA] * alpha]
+    photographs = {(cameras.parent / _posix(view.name)).resolve(): view.name for view in views} if cameras else {}
+    draw = _drawer(gaussians, background)
+    if out.suffix.lower() == VIDEO:
+        written = _film(draw, shots, out, fps, kinds)
+    else:
+        written = _pictures(draw, shots, out, kinds, photographs)
+    for file in written:
+        print(file)
+    print(f"{len(gaussians)} Gaussians drawn in {len(shots)} pictures; open {out} in any {_viewer(out)}")
 
 
 def main() -> None:
@@ -85,28 +84,118 @@ def main() -> None:
     typer.run(render)
 
 
-def _targets(views: Sequence[Camera], image_folder: Path, out: Path) -> list[Path]:
-    """The picture's file for each camera; raises InputError if one would overwrite another, or a photograph."""
-    name_of: dict[Path, str] = {}
-    for view in views:
-        image = PurePosixPath(view.name.replace("\\", "/"))
-        target = out / f"{image.stem}.png"
-        if target in name_of:
+def _shots(
+    gaussians: Gaussians,
+    views: Sequence[Camera],
+    orbit: bool,
+    path: bool,
+    degrees: float | None,
+    frames: int,
+    size: str | None,
+) -> list[Camera]:
+    """Where to draw the scene from."""
+    if views and size:
+        views = [fitted(view, *parse_size(size)) for view in views]
+    if path:
+        return along_path(views, frames)
+    if orbit:
+        centre = list(views) or [overview(gaussians, *parse_size(size or SIZE))]
+        return around(gaussians, centre, degrees or (SWING if views else FULL_TURN), frames)
+    return list(views) or [overview(gaussians, *parse_size(size or SIZE))]
+
+
+def _drawer(gaussians: Gaussians, background: tuple[float, float, float]) -> Callable[[Camera], Rendering]:
+    def draw(shot: Camera) -> Rendering:
+        return draw_view(gaussians, shot.extrinsics, shot.K, shot.width, shot.height, background)
+
+    return draw
+
+
+def _film(
+    draw: Callable[[Camera], Rendering], shots: Sequence[Camera], out: Path, fps: float, kinds: Sequence[str]
+) -> list[Path]:
+    """A video of each kind; the paths written."""
+    width, height = shots[0].width, shots[0].height
+    for shot in shots:
+        if (shot.width, shot.height) != (width, height):
             raise InputError(
-                f"cameras {name_of[target]} and {view.name} would both be drawn to {target}; "
-                "rename one image, or split the cameras into two files"
+                f"--out {out}: {shot.name} has {shot.width}x{shot.height} pixels, {shots[0].name} {width}x{height}, "
+                "and a video has one size; add --size"
             )
-        if target.resolve() == (image_folder / image).resolve():
-            raise InputError(f"--out: the picture {target} would overwrite the photograph; choose another folder")
-        name_of[target] = view.name
-    return list(name_of)
+    check_writable(out.parent)
+    ends: tuple[float, float] | None = None  # the first frame's, so that colours mean the same in all
+    with ExitStack() as stack:
+        films = {kind: out.with_stem(out.stem + kind) for kind in kinds}
+        add = {kind: stack.enter_context(open_video(film, width, height, fps)) for kind, film in films.items()}
+        for shot in progress(shots, "drawing"):
+            drawn = draw(shot)
+            ends = ends or depth_ends(_depth(drawn))
+            for kind in kinds:
+                add[kind](_picture(drawn, kind, ends))
+    return list(films.values())
 
 
-def _with_progress(views: Sequence[tuple[Camera, Path]]) -> Iterable[tuple[Camera, Path]]:
-    """The views, with a bar on stderr where that is a terminal."""
-    if not sys.stderr.isatty():
-        return views
-    from rich.console import Console
-    from rich.progress import track
+def _pictures(
+    draw: Callable[[Camera], Rendering],
+    shots: Sequence[Camera],
+    out: Path,
+    kinds: Sequence[str],
+    photographs: dict[Path, str],
+) -> list[Path]:
+    """A picture of each kind for each shot, and metric depth; the paths written."""
+    stems = _stems(shots, out, kinds, photographs)
+    check_writable(make_folder(stems[0].parent))
+    written = []
+    for shot, stem in progress(list(zip(shots, stems, strict=True)), "drawing"):
+        drawn = draw(shot)
+        for kind in kinds:
+            target = stem.with_name(stem.name + kind + PICTURE)
+            save_png(target, _picture(drawn, kind))
+            written.append(target)
+        if DEPTH in kinds:
+            metric = stem.with_name(stem.name + DEPTH + ".npz")
+            with replacing(metric) as temporary:
+                np.savez_compressed(temporary, depth=_depth(drawn))
+            written.append(metric)
+    return written
 
-    return track(views, "Drawing", console=Console(stderr=True))
+
+def _depth(drawn: Rendering) -> np.ndarray:
+    """The mean depth of what stops the light, in world units, 0 where most of it passes."""
+    return np.where(drawn.alpha >= SOLID, drawn.depth / np.maximum(drawn.alpha, SOLID), 0).astype(np.float32)
+
+
+def _picture(drawn: Rendering, kind: str, ends: tuple[float, float] | None = None) -> np.ndarray:
+    """One kind of picture of a rendering, RGB in [0, 1], [height, width, 3]."""
+    if kind == DEPTH:
+        return depth_colours(_depth(drawn), ends)
+    return np.repeat(drawn.alpha[..., None], 3, axis=2) if kind == ALPHA else drawn.rgb
+
+
+def _stems(shots: Sequence[Camera], out: Path, kinds: Sequence[str], photographs: dict[Path, str]) -> list[Path]:
+    """The pictures' paths without kind and suffix; none of them may overwrite another, or a photograph."""
+    one = out.suffix.lower() == PICTURE
+    if one and len(shots) > 1:
+        raise InputError(f"--out {out}: {len(shots)} pictures do not fit one file; give a folder or an .mp4")
+    stems = [out.with_suffix("")] if one else [out / _posix(shot.name).stem for shot in shots]
+    name_of: dict[Path, str] = {}
+    for shot, stem in zip(shots, stems, strict=True):
+        for kind in kinds:
+            target = stem.with_name(stem.name + kind + PICTURE)
+            if target in name_of:
+                raise InputError(
+                    f"cameras {name_of[target]} and {shot.name} would both be drawn to {target}; "
+                    "rename one image, or split the cameras into two files"
+                )
+            if target.resolve() in photographs:
+                raise InputError(f"--out: the picture {target} would overwrite the photograph; choose another folder")
+            name_of[target] = shot.name
+    return stems
+
+
+def _posix(name: str) -> PurePosixPath:
+    return PurePosixPath(name.replace("\\", "/"))  # files written on Windows
+
+
+def _viewer(out: Path) -> str:
+    return "browser or video player" if out.suffix.lower() == VIDEO else "image viewer"

@@ -7,13 +7,13 @@ import pytest
 from idesplat.runtime.cameras import Camera, read_cameras
 from idesplat.runtime.cleaning import Cleaning, clean, describe
 from idesplat.runtime.consistency import confidence, depth_jumps
+from idesplat.runtime.drawing import draw_view
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.gaussians import SH_0, Gaussians
 from idesplat.runtime.images import load_image
 from idesplat.runtime.merging import merged
 from idesplat.runtime.point_cloud import points_from_depth
 from idesplat.runtime.quaternions import quaternions_from_matrices, rotation_matrices
-from idesplat.runtime.render import draw_view
 
 HEIGHT, WIDTH = 12, 16
 ARRAYS = ("means", "scales", "quats", "opacities", "sh")

@@ -9,13 +9,15 @@ import cv2
 import numpy as np
 import pytest
 from idesplat.runtime.cameras import Camera, write_cameras
+from idesplat.runtime.drawing import draw_view, world_to_camera
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.gaussians import Gaussians
 from idesplat.runtime.images_out import save_depth_png, save_png
-from idesplat.runtime.paths import interpolate_extrinsics
+from idesplat.runtime.paths import interpolate_extrinsics, orbit_extrinsics
 from idesplat.runtime.ply import read_ply, write_ply
 from idesplat.runtime.rasterizer import rasterize
-from idesplat.runtime.render import draw_view, main, world_to_camera
+from idesplat.runtime.render import main
+from idesplat.runtime.shots import around, fitted, overview
 
 SH_0 = 0.28209479177387814
 
@@ -147,7 +149,7 @@ def test_pictures_never_overwrite_photographs(
         ("none.ply", "cameras.json", (0, 0, 0), "none.ply: No such file"),
         ("cameras.json", "cameras.json", (0, 0, 0), "cameras.json: expected a splat file"),
         ("scene.ply", "none.json", (0, 0, 0), "none.json"),
-        ("scene.ply", "scene.ply", (0, 0, 0), "not valid JSON"),
+        ("scene.ply", "scene.ply", (0, 0, 0), "scene.ply: is none of the camera files"),
         ("scene.ply", "cameras.json", (0, 255, 0), "--background is (0.0, 255.0, 0.0)"),
         ("scene.ply", "cameras.json", (0, "nan", 0), "--background is (0.0, nan, 0.0)"),
     ],
@@ -187,6 +189,193 @@ def test_draw_view_takes_camera_to_world() -> None:
     # 50.5 + 101 * 0.1 / 2 = 55.55 and 40.5 - 101 * 0.2 / 2 = 30.4 are the pixels 55 and 30
     assert np.unravel_index(drawn.alpha.argmax(), (81, 101)) == (30, 55)
     assert drawn.depth[30, 55] / drawn.alpha[30, 55] == pytest.approx(2, abs=1e-5)
+
+
+# ---- stills, orbits, paths, videos
+
+
+def a_ball_of_gaussians(centre: tuple[float, float, float] = (1, -2, 5), count: int = 300) -> Gaussians:
+    rng = np.random.default_rng(1)
+    offsets = rng.normal(size=(count, 3))
+    offsets /= np.linalg.norm(offsets, axis=1, keepdims=True)
+    return Gaussians(
+        means=(np.array(centre) + offsets).astype(np.float32),
+        scales=np.full((count, 3), 0.1, np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        opacities=np.full(count, 0.9, np.float32),
+        sh=rng.uniform(-1, 1, (count, 1, 3)).astype(np.float32),
+    )
+
+
+def read_video(path: Path) -> tuple[np.ndarray, float]:
+    """All frames as RGB, [frames, height, width, 3], and how many a second."""
+    video = cv2.VideoCapture(str(path))
+    frames = []
+    while (frame := video.read()[1]) is not None:
+        frames.append(frame[..., ::-1])
+    return np.stack(frames), video.get(cv2.CAP_PROP_FPS)
+
+
+def psnr(drawn: np.ndarray, expected: np.ndarray) -> float:
+    return float(-10 * np.log10(np.square(drawn / 255 - np.clip(expected, 0, 1)).mean()))
+
+
+@pytest.mark.parametrize(("height", "width"), [(40, 60), (60, 40)])
+def test_an_overview_shows_all_of_the_scene_and_little_else(height: int, width: int) -> None:
+    camera = overview(a_ball_of_gaussians(), height, width)
+    alpha = draw_view(a_ball_of_gaussians(), camera.extrinsics, camera.K, width, height).alpha
+    rows, columns = np.nonzero(alpha > 0.2)
+    assert rows.min() > 0 and rows.max() < height - 1 and columns.min() > 0 and columns.max() < width - 1
+    # It fits the sphere around the box, not the ball itself, hence with room to spare.
+    assert np.ptp(rows) > 0.4 * min(height, width) and np.ptp(columns) > 0.4 * min(height, width)
+    np.testing.assert_array_equal(camera.extrinsics[:3, :3], np.eye(3))
+    with pytest.raises(InputError, match="nothing to draw"):
+        faint = a_ball_of_gaussians()
+        faint.opacities[:] = 0.01
+        overview(faint, height, width)
+
+
+def test_an_orbit_keeps_looking_at_its_pivot() -> None:
+    start, pivot = pose((0.1, 0.2, 0), (0, 0, -4)), np.array([0.5, 0.2, 0])
+    poses = orbit_extrinsics(start, pivot, np.array([0, -2.0, 0]), 360, 8)
+    np.testing.assert_allclose(poses[0], start, atol=1e-12)
+    seen = [np.linalg.inv(camera)[:3] @ [*pivot, 1] for camera in poses]
+    np.testing.assert_allclose(seen, [seen[0]] * 8, atol=1e-12)  # at the same place of every picture
+    np.testing.assert_allclose(poses[:, 1, 3], 0, atol=1e-12)  # at the same height
+    np.testing.assert_allclose((poses[2, :3, 3] - pivot)[[0, 2]], [4, -0.5], atol=1e-12)  # a quarter on: from the right
+    np.testing.assert_allclose(poses[:, :3, 3].mean(axis=0), [0.5, 0, 0], atol=1e-12)
+    swing = orbit_extrinsics(start, pivot, np.array([0, -2.0, 0]), 30, 8)
+    turned = [np.degrees(np.linalg.norm(cv2.Rodrigues(camera[:3, :3] @ start[:3, :3].T)[0])) for camera in swing]
+    np.testing.assert_allclose(
+        turned, [0, 15 * 0.5**0.5, 15, 15 * 0.5**0.5, 0, 15 * 0.5**0.5, 15, 15 * 0.5**0.5], atol=1e-6
+    )
+    np.testing.assert_allclose(swing[2] @ np.linalg.inv(start) @ swing[6], start, atol=0.2)  # to either side
+    for degrees, frames in ((0, 5), (361, 5), (float("nan"), 5), (90, 0)):
+        with pytest.raises(InputError, match="orbit of"):
+            orbit_extrinsics(start, pivot, np.array([0, -1.0, 0]), degrees, frames)
+
+
+def test_an_orbit_goes_around_what_the_cameras_look_at() -> None:
+    ball = a_ball_of_gaussians((0, 0, 0))
+    cameras = [Camera(f"{x}", 40, 30, pinhole(40, 30), pose((0, 0, 0), (x, 0, -4))) for x in (-0.1, 0.0, 0.1)]
+    shots = around(ball, cameras, 360, 4)
+    np.testing.assert_allclose(shots[0].extrinsics, cameras[1].extrinsics, atol=1e-12)
+    opposite = shots[2].extrinsics
+    np.testing.assert_allclose(opposite[:3, 2], [0, 0, -1], atol=1e-9)
+    assert -1 < (opposite[2, 3] - 4) / 2 < 0  # the pivot is on the ball's near side, between -1 and 0
+    with pytest.raises(InputError, match="sees nothing of the scene"):
+        around(ball, [Camera("away", 40, 30, pinhole(40, 30), pose((0, np.pi, 0), (0, 0, -4)))], 360, 4)
+
+
+def test_another_size_shows_what_the_camera_showed() -> None:
+    ball = a_ball_of_gaussians((0, 0, 4))
+    camera = Camera("a", 60, 40, pinhole(60, 40), np.eye(4))
+    wide = fitted(camera, 40, 100)
+    whole = draw_view(ball, wide.extrinsics, wide.K, 100, 40).rgb
+    own = draw_view(ball, camera.extrinsics, camera.K, 60, 40).rgb
+    np.testing.assert_allclose(whole[:, 20:80], own, atol=1e-5)
+    half = fitted(camera, 20, 30)
+    np.testing.assert_allclose(half.K, [[30, 0, 15], [0, 30, 10], [0, 0, 1]])
+
+
+def test_a_still_without_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_ply(tmp_path / "scene.ply", a_ball_of_gaussians())
+    assert run(monkeypatch, tmp_path / "scene.ply", "--out", tmp_path / "still.png", "--size", "48x64") == 0
+    picture = read_rgb(tmp_path / "still.png")
+    camera = overview(a_ball_of_gaussians(), 48, 64)
+    expected = draw_view(a_ball_of_gaussians(), camera.extrinsics, camera.K, 64, 48).rgb
+    assert psnr(picture, expected) > 45
+    assert {path.name for path in tmp_path.iterdir()} == {"scene.ply", "still.png"}
+
+
+def test_depth_and_alpha_beside_the_colours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ball = one_gaussian((0, 0, 3), (1, 1, 1))
+    write_ply(tmp_path / "scene.ply", ball)
+    write_cameras(tmp_path / "cameras.json", [Camera("a.jpg", 41, 31, pinhole(41, 31), np.eye(4))])
+    out = tmp_path / "out"
+    arguments = (tmp_path / "scene.ply", "--cameras", tmp_path / "cameras.json", "--out", out, "--depth", "--alpha")
+    assert run(monkeypatch, *arguments) == 0
+    names = ["a-alpha.png", "a-depth.npz", "a-depth.png", "a.png"]
+    assert sorted(path.name for path in out.iterdir()) == names
+    depth = np.load(out / "a-depth.npz")["depth"]
+    assert depth[15, 20] == pytest.approx(3, abs=1e-5)  # metric, though the splat lets 1 % of the light through
+    assert depth[0, 0] == 0
+    assert read_rgb(out / "a-alpha.png")[15, 20].tolist() == [round(0.99 * 255)] * 3
+    assert not read_rgb(out / "a-alpha.png")[0, 0].any()
+    assert read_rgb(out / "a-depth.png")[15, 20].any() and not read_rgb(out / "a-depth.png")[0, 0].any()
+
+
+def test_an_orbit_as_a_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    ball = a_ball_of_gaussians()
+    write_ply(tmp_path / "scene.ply", ball)
+    out = tmp_path / "orbit.mp4"
+    options = ("--orbit", "--frames", 6, "--fps", 12, "--size", "97x128", "--depth", "--alpha")
+    assert run(monkeypatch, tmp_path / "scene.ply", "--out", out, *options) == 0
+    shots = around(ball, [overview(ball, 97, 128)], 360, 6)
+    films = {name: read_video(tmp_path / f"orbit{name}.mp4") for name in ("", "-depth", "-alpha")}
+    assert {path.name for path in tmp_path.iterdir()} == {"scene.ply", *(f"orbit{name}.mp4" for name in films)}
+    for frames, fps in films.values():
+        assert frames.shape == (6, 96, 128, 3)  # videos have even sides
+        assert fps == pytest.approx(12)
+    for index, shot in enumerate(shots):
+        drawn = draw_view(ball, shot.extrinsics, shot.K, 128, 97)
+        assert psnr(films[""][0][index], drawn.rgb[:96]) > 25
+        assert psnr(films["-alpha"][0][index], np.repeat(drawn.alpha[:96, :, None], 3, axis=2)) > 25
+    assert psnr(films[""][0][3], draw_view(ball, shots[0].extrinsics, shots[0].K, 128, 97).rgb[:96]) < 25
+    assert "orbit-depth.mp4" in capsys.readouterr().out
+
+
+def test_a_path_through_the_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ball = a_ball_of_gaussians((0, 0, 0))
+    write_ply(tmp_path / "scene.ply", ball)
+    cameras = [Camera(f"{index}", 40, 30, pinhole(40, 30), pose((0, 0, 0), (index, 0, -4))) for index in range(3)]
+    write_cameras(tmp_path / "cameras.json", cameras)
+    options = ("--cameras", tmp_path / "cameras.json", "--path", "--frames", 5, "--out", tmp_path / "out")
+    assert run(monkeypatch, tmp_path / "scene.ply", *options) == 0
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        f"frame-{index:04d}.png" for index in range(5)
+    ]
+    for index, x in enumerate((0, 0.5, 1, 1.5, 2)):
+        expected = draw_view(ball, pose((0, 0, 0), (x, 0, -4)), pinhole(40, 30), 40, 30).rgb
+        assert psnr(read_rgb(tmp_path / "out" / f"frame-{index:04d}.png"), expected) > 45
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--out", "out", "--path"), "--path: needs the cameras"),
+        (("--out", "out", "--path", "--orbit"), "expected one of them"),
+        (("--out", "out", "--size", "huge"), "--size huge: expected HEIGHTxWIDTH"),
+        (("--out", "out", "--orbit", "--degrees", "400"), "expected one frame, 0 to 360 degrees"),
+        (("--out", "a.mp4", "--fps", "0"), "--fps 0: expected frames a second"),
+        (("--out", "a.mp4", "--cameras", "cameras.json"), "a video has one size; add --size"),
+        (("--out", "a.png", "--cameras", "cameras.json"), "2 pictures do not fit one file"),
+        (("--out", "a.png", "--orbit"), "90 pictures do not fit one file"),
+        (("--out", "nowhere/a.mp4"), "cannot write into nowhere"),
+    ],
+)
+def test_requests_that_make_no_picture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, options: tuple, message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_ply(Path("scene.ply"), a_ball_of_gaussians())
+    cameras = [Camera(f"{size}", size, 30, pinhole(size, 30), pose((0, 0, 0), (1, -2, 0))) for size in (20, 30)]
+    write_cameras(Path("cameras.json"), cameras)
+    assert run(monkeypatch, "scene.ply", *options) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+    assert {path.name for path in tmp_path.iterdir()} == {"scene.ply", "cameras.json"}
+
+
+def test_a_depth_picture_never_overwrites_another_cameras(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    write_ply(tmp_path / "scene.ply", a_ball_of_gaussians())
+    cameras = [Camera(name, 20, 30, pinhole(20, 30), pose((0, 0, 0), (1, -2, 0))) for name in ("a.jpg", "a-depth.jpg")]
+    write_cameras(tmp_path / "cameras.json", cameras)
+    options = ("--cameras", tmp_path / "cameras.json", "--out", tmp_path / "out", "--depth")
+    assert run(monkeypatch, tmp_path / "scene.ply", *options) == 2
+    assert "cameras a.jpg and a-depth.jpg would both be drawn to" in capsys.readouterr().err
 
 
 # ---- camera paths

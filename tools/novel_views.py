@@ -7,10 +7,10 @@ from typing import Any
 import cv2
 import numpy as np
 
+from ..runtime.cameras import invert_rigid
 from ..runtime.gaussians import Gaussians
 from ..runtime.images_out import depth_colours
 from ..runtime.rasterizer import Rendering, rasterize
-from ..runtime.render import world_to_camera
 from ..runtime.runner import Runner
 from .baselines import best_plane, nearest_view
 from .cases import Case, Posed
@@ -116,7 +116,7 @@ def draw(gaussians: Gaussians, targets: Posed, view: int, nearest_drawn: float =
         gaussians.scales,
         gaussians.opacities,
         gaussians.sh,
-        world_to_camera(targets.extrinsics[view].astype(np.float64)),
+        invert_rigid(targets.extrinsics[view]),
         targets.K(view),
         width,
         height,

@@ -11,9 +11,9 @@ import typer
 
 from ..runtime.cameras import read_cameras
 from ..runtime.default_model import default_model
+from ..runtime.drawing import draw_view
 from ..runtime.errors import exit_on_input_error
 from ..runtime.images_out import depth_colours, save_png
-from ..runtime.render import draw_view
 from ..runtime.runner import Runner
 from ..runtime.views import prepare
 
