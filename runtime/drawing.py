@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from .cameras import invert_rigid
 from .gaussians import Gaussians
 from .rasterizer import Rendering, rasterize
 
@@ -26,17 +27,9 @@ def draw_view(
         gaussians.scales,
         gaussians.opacities,
         gaussians.sh,
-        world_to_camera(extrinsics),
+        invert_rigid(extrinsics),
         K,
         width,
         height,
         background,
     )
-
-
-def world_to_camera(extrinsics: np.ndarray) -> np.ndarray:
-    """The viewmat [4, 4] of a rigid camera-to-world pose [4, 4]."""
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = extrinsics[:3, :3].T
-    viewmat[:3, 3] = -extrinsics[:3, :3].T @ extrinsics[:3, 3]
-    return viewmat
