@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ from .depth_range import DepthRange, find_depth_range
 from .errors import InputError
 from .gaussians import Gaussians
 from .scene_frame import SceneFrame
-from .session import CPU, open_session, provider_name, run_session
+from .session import CPU, USUAL, Tuning, open_session, provider_name, run_session
 from .sizes import size_fits, size_rule
 from .views import Views, check_views, prepare
 
@@ -35,10 +35,11 @@ class Runner:
 
     model: a `.onnx` of this project, or a folder that `idesplat-export --staged` wrote.
     provider: an ONNX Runtime execution provider, such as CPU or CUDA.
+    tuning: threads and profiling, for those who measure.
     Raises InputError if the model is not ours or damaged, or the provider is not there.
     """
 
-    def __init__(self, model: Path | str, provider: str = CPU) -> None:
+    def __init__(self, model: Path | str, provider: str = CPU, tuning: Tuning = USUAL) -> None:
         self.path = Path(model)
         if not self.path.exists():
             raise InputError(f"{self.path}: no such model; give a .onnx file or staged folder made by idesplat-export")
@@ -46,7 +47,9 @@ class Runner:
         stages = read_manifest(self.path) if self.path.is_dir() else [StageFile(FUSED, self.path.name, [], [])]
         folder = self.path if self.path.is_dir() else self.path.parent
         started = time.perf_counter()
-        self._stages = [(stage, open_session(folder / stage.file, provider)) for stage in stages]
+        self._stages = [
+            (stage, open_session(folder / stage.file, provider, _profiled(tuning, stage))) for stage in stages
+        ]
         self.load_seconds = time.perf_counter() - started
         properties = self._stages[0][1].get_modelmeta().custom_metadata_map
         self.description: Description = read_description(properties, self.path)
@@ -113,6 +116,10 @@ class Runner:
         }
         return self._run(values, frame)
 
+    def end_profiling(self) -> list[Path]:
+        """Stop noting operators, where `tuning.profile` asked for it; the files of notes, one for each stage."""
+        return [Path(session.end_profiling()) for _, session in self._stages]
+
     def size_for(self, cameras: Sequence[Camera]) -> tuple[int, int]:
         """The trained height and width, turned upright where most pictures are and the model leaves the choice."""
         own = self.description
@@ -145,6 +152,13 @@ class Runner:
             values = {name: value for name, value in values.items() if name in keep or len(self._stages) == 1}
         gaussians = Gaussians(*(values[name] for name in ("means", "scales", "quats", "opacities", "sh")))
         return Prediction(frame.leave_depth(values["depth"]), frame.leave(gaussians), seconds)
+
+
+def _profiled(tuning: Tuning, stage: StageFile) -> Tuning:
+    """`tuning` with a file of notes of the stage's own."""
+    if tuning.profile is None:
+        return tuning
+    return replace(tuning, profile=tuning.profile.with_name(f"{tuning.profile.name}-{stage.name}"))
 
 
 def _last_uses(stages: list[StageFile]) -> list[set[str]]:

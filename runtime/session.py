@@ -1,6 +1,7 @@
 """ONNX Runtime sessions: providers checked, threads and memory set from measurement."""
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from .graph_cache import place_for
 
 CPU = "CPUExecutionProvider"
 ERRORS_ONLY = 3
+AS_MANY_AS_CORES = 0  # threads
 SUFFIX = "ExecutionProvider"
 
 
@@ -25,18 +27,29 @@ def provider_name(provider: str) -> str:
     raise InputError(f"execution provider {provider} is not installed; this ONNX Runtime offers {offered}")
 
 
-def open_session(
-    model: Path | bytes, provider: str = CPU, threads: int | None = None, profile: Path | None = None
-) -> onnxruntime.InferenceSession:
-    """Load a graph on one execution provider.
+@dataclass(frozen=True)
+class Tuning:
+    """How sessions are opened, for those who measure; everyone else does best with the defaults."""
 
-    provider: a full name, as `provider_name` gives it. threads: all that the process may use, where not given.
-    profile: beginning of the name of a file in which ONNX Runtime notes the times of all operators.
-    A file's optimised graph is kept for the next time where the provider is the CPU (see `graph_cache`).
+    # None: as many as the process may use.
+    threads: int | None = None
+    # The beginning of the name of a file in which ONNX Runtime notes the time and the shapes of every operator.
+    profile: Path | None = None
+    # False runs the graph as it stands in the file.
+    optimise: bool = True
+
+
+USUAL = Tuning()
+
+
+def open_session(model: Path | bytes, provider: str = CPU, tuning: Tuning = USUAL) -> onnxruntime.InferenceSession:
+    """Load a graph on one execution provider, given by its full name, as `provider_name` gives it.
+
+    On the CPU a file's optimised graph is kept for the next time (see `graph_cache`).
     Raises InputError if the file cannot be loaded, or if ONNX Runtime silently fell back to another provider.
     """
-    options = _options(threads, profile)
-    if provider == CPU and isinstance(model, Path):
+    options = _options(tuning)
+    if provider == CPU and isinstance(model, Path) and tuning.optimise:
         cached = _open_cached(model, options)
         if cached is not None:
             return cached
@@ -63,18 +76,20 @@ def usable_cores() -> int:
     return os.cpu_count() or 1
 
 
-def _options(threads: int | None, profile: Path | None) -> onnxruntime.SessionOptions:
+def _options(tuning: Tuning) -> onnxruntime.SessionOptions:
     options = onnxruntime.SessionOptions()
     options.log_severity_level = ERRORS_ONLY
     # Its planning is quadratic in the number of nodes: without it a session opens ten times faster, and a run takes
     # neither longer nor more memory, because the arena reuses buffers all the same.
     options.enable_mem_reuse = False
     # Left alone, ONNX Runtime 1.31 pins a thread to every core, also to those that the process was told to keep off.
-    if threads is None and usable_cores() < (os.cpu_count() or 1):
-        threads = usable_cores()
-    options.intra_op_num_threads = threads or 0
-    if profile is not None:
-        options.enable_profiling, options.profile_file_prefix = True, str(profile)
+    restricted = usable_cores() < (os.cpu_count() or 1)
+    options.intra_op_num_threads = tuning.threads or (usable_cores() if restricted else AS_MANY_AS_CORES)
+    if tuning.profile is not None:
+        options.enable_profiling, options.profile_file_prefix = True, str(tuning.profile)
+    if not tuning.optimise:
+        options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+        options.add_session_config_entry("session.disable_prepacking", "1")  # else a profile misses weights' shapes
     return options
 
 

@@ -216,7 +216,7 @@ def test_a_session_keeps_to_the_cores_that_the_process_may_use(model, monkeypatc
     """Left to itself, ONNX Runtime pins threads to the others, too."""
     monkeypatch.setattr(session.os, "cpu_count", lambda: 64)
     monkeypatch.setattr(session, "usable_cores", lambda: 3)
-    assert session._options(None, None).intra_op_num_threads == 3
-    assert session._options(2, None).intra_op_num_threads == 2
+    assert session._options(session.USUAL).intra_op_num_threads == 3
+    assert session._options(session.Tuning(threads=2)).intra_op_num_threads == 2
     monkeypatch.setattr(session, "usable_cores", lambda: 64)
-    assert session._options(None, None).intra_op_num_threads == 0
+    assert session._options(session.USUAL).intra_op_num_threads == session.AS_MANY_AS_CORES
