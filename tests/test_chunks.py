@@ -203,8 +203,7 @@ def test_skips_scenes_that_are_damaged(spoil: Callable, expected: str, scene: Pa
         raise InputError(skipped["a"])
 
 
-@pytest.mark.parametrize(("package", "name"), [("torch", "PyTorch"), ("PIL", "Pillow")])
-def test_says_what_is_not_installed(package: str, name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(chunks, "find_spec", lambda wanted: None if wanted == package else object())
-    with pytest.raises(InputError, match=f"{name} is needed.*pip install"):
+def test_says_that_torch_is_not_installed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(chunks, "find_spec", lambda package: None)
+    with pytest.raises(InputError, match="PyTorch is needed.*pip install"):
         read_chunk(folder / "000000.torch")

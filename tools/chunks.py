@@ -30,7 +30,6 @@ CAMERA_NUMBERS = 18
 FIRST_POSE_NUMBER = 6
 # Of the near plane: the releases' renderer draws no Gaussian that is nearer to the camera.
 NEAREST_DRAWN = 0.2
-NEEDED = {"torch": "PyTorch", "PIL": "Pillow"}
 INSTALL = "pip install 'idesplat[eval]'"
 
 
@@ -79,9 +78,8 @@ def read_chunk(path: Path) -> list[dict[str, Any]]:
 
     Raises InputError if it cannot be loaded so, or is no list of scenes.
     """
-    for package, name in NEEDED.items():
-        if find_spec(package) is None:
-            raise InputError(f"{path}: {name} is needed to read chunks, and is not installed; {INSTALL}")
+    if find_spec("torch") is None:
+        raise InputError(f"{path}: PyTorch is needed to read chunks, and is not installed; {INSTALL}")
     import torch
 
     try:

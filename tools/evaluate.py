@@ -1,6 +1,5 @@
 """The command idesplat-eval: how well an exported model draws views that it was not given, in the field's measures."""
 
-import sys
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from functools import partial
@@ -191,13 +190,11 @@ def _evaluate(
 
     skip: hears of a case that the model cannot take, and why; without it that is an error.
     """
-    from rich.console import Console
-    from rich.progress import track
-
     from ..runtime.images_out import save_png
+    from ..runtime.progress import progress
 
     results: list[Result] = []
-    for case in track(cases, "Evaluating", total, console=Console(stderr=True), disable=not sys.stderr.isatty()):
+    for case in progress(cases, "evaluating", total):
         strips: dict[str, np.ndarray] = {}
         try:
             results.append(evaluator.evaluate(case, strips.__setitem__ if len(results) < pictured else None))
