@@ -205,5 +205,5 @@ def test_skips_scenes_that_are_damaged(spoil: Callable, expected: str, scene: Pa
 
 def test_says_that_torch_is_not_installed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(chunks, "find_spec", lambda package: None)
-    with pytest.raises(InputError, match="PyTorch is needed.*pip install"):
+    with pytest.raises(InputError, match=r"PyTorch is needed.*pip install"):
         read_chunk(folder / "000000.torch")
