@@ -1,6 +1,5 @@
 """The command idesplat-export: a checkpoint to ONNX, verified."""
 
-import hashlib
 import shutil
 import sys
 import tempfile
@@ -13,15 +12,12 @@ import typer
 
 from ..runtime.bundle import MANIFEST_NAME, Description, StageFile, write_manifest
 from ..runtime.errors import InputError, exit_on_input_error
-from ..runtime.files import check_writable, make_folder, replacing
+from ..runtime.files import check_writable, make_folder
 from ..runtime.sizes import parse_size, size_fits, size_rule
 
 if TYPE_CHECKING:
-    import onnx
-
-    from ..model.depthsplat import DepthSplat
-    from ..model.idesplat import IDESplat
-    from .exporter import Fixed
+    from ..model.networks import Network
+    from .exporter import Fixed, Graphs
     from .verify import Parity
 
 PARITY_BREACH = 1
@@ -51,11 +47,11 @@ def export(
     from .exporter import Fixed
 
     try:
-        model, name = _load(checkpoint, preset)
+        model, name, digest = _load(checkpoint, preset)
     except CheckpointError as error:
         raise InputError(str(error)) from None
     fixed = Fixed(views, _fitting_size(size, model.config.size_multiple) if size else None)
-    description = _describe(model, name, checkpoint, fixed)
+    description = _describe(model, name, checkpoint.name, digest, fixed)
     if not _export(model, description, fixed, out, staged):
         print("error: the graph departs from the network (see the table); nothing was written", file=sys.stderr)
         raise SystemExit(PARITY_BREACH)
@@ -90,36 +86,33 @@ def _fitting_size(text: str, multiple: int) -> tuple[int, int]:
     return height, width
 
 
-def _load(checkpoint: Path, preset: str | None) -> "tuple[IDESplat | DepthSplat, str]":
-    """The network with the file's weights, and the preset's name."""
-    from ..model.checkpoint import fill, infer_preset, name_hash_warning, read_state_dict
+def _load(checkpoint: Path, preset: str | None) -> "tuple[Network, str, str]":
+    """The network with the file's weights, the preset's name, and the file's SHA-256."""
+    from ..model.checkpoint import file_sha256, fill, infer_preset, name_hash_warning, read_state_dict
     from ..model.config import PRESETS
-    from ..model.depthsplat import DepthSplat
-    from ..model.idesplat import IDESplat
     from ..model.networks import build
 
     if preset is not None and preset not in PRESETS:
         raise InputError(f"--preset {preset}: unknown; choose one of {', '.join(PRESETS)}")
     print(f"reading {checkpoint}")
-    warning = name_hash_warning(checkpoint) if checkpoint.is_file() else None
+    digest = file_sha256(checkpoint)
+    warning = name_hash_warning(checkpoint, digest)
     if warning:
         print(f"warning: {warning}", file=sys.stderr)
     tensors = read_state_dict(checkpoint)
     name = preset or infer_preset(checkpoint, tensors)
     model = build(name)
-    if not isinstance(model, IDESplat | DepthSplat):
-        raise InputError(f"{checkpoint}: preset {name} has depth alone, which cannot be exported yet")
     fill(model, tensors, checkpoint)
     count = sum(parameter.numel() for parameter in model.parameters())
     print(f"preset {name}, {count:,} parameters")
-    return model.eval(), name
+    return model.eval(), name, digest
 
 
-def _describe(model: "IDESplat | DepthSplat", preset: str, checkpoint: Path, fixed: "Fixed") -> Description:
+def _describe(model: "Network", preset: str, checkpoint: str, digest: str, fixed: "Fixed") -> Description:
+    from ..model.depthsplat import DepthSplatDepth
+
     config = model.config
     height, width = fixed.size or (config.height, config.width)
-    with checkpoint.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
     return Description(
         preset=preset,
         height=height,
@@ -132,66 +125,55 @@ def _describe(model: "IDESplat | DepthSplat", preset: str, checkpoint: Path, fix
         trained_views=list(config.trained_views),
         trained_sides=list(config.trained_sides),
         sh_degree=config.sh_degree,
-        checkpoint=checkpoint.name,
+        checkpoint=checkpoint,
         checkpoint_sha256=digest,
         version=version("idesplat"),
+        gaussians=not isinstance(model, DepthSplatDepth),
     )
 
 
-def _export(
-    model: "IDESplat | DepthSplat", description: Description, fixed: "Fixed", out: Path | None, staged: Path | None
-) -> bool:
+def _export(model: "Network", description: Description, fixed: "Fixed", out: Path | None, staged: Path | None) -> bool:
     """Trace, verify and write; False and nothing written if the graph departs from the network."""
-    import onnx
     from rich.console import Console
 
-    from .exporter import fused_graph, trace
+    from .exporter import OPSET, freeze
     from .stages import NamedTensors
     from .verify import verify
+    from .weights import hand_out
 
     console = Console(stderr=True)
     network = NamedTensors(model)
-    with console.status("tracing the network (a minute or so)"):
-        traced = trace(network, description.near, description.far, description.size_multiple, fixed)
-        fused = fused_graph(traced, description)
-        onnx.checker.check_model(fused, full_check=True)
-        content = fused.SerializeToString()
-    print(f"traced: {len(fused.graph.node)} nodes, opset 20, {len(content) / 1e6:.0f} MB")
-    rows = []
-    with console.status("verifying against PyTorch") as status:
-        for row in verify(network, traced, content, description, fixed):
-            rows.append(row)
-            status.update(f"verifying against PyTorch: {row.case}, {row.stage}")
-    _print_table(rows)
-    if not all(row.passed for row in rows):
-        return False
-    if out is not None:
-        with replacing(out) as temporary:
-            temporary.write_bytes(content)
-        print(f"wrote {out}\nrun it with: idesplat-infer --model {out} --images ... --cameras ... --out scene.ply")
-    if staged is not None:
-        _write_stages(traced, description, staged)
-        print(
-            f"wrote {staged}\nrun it with: idesplat-infer --model {staged} --images ... --cameras ... --out scene.ply"
-        )
+    # Beside the results, where there must be room for them; a system's folder for temporary files may lie in memory.
+    with tempfile.TemporaryDirectory(prefix=".idesplat-export.", dir=(out or staged or Path()).parent) as folder:
+        with console.status("tracing the network (a minute or so)"):
+            graphs = freeze(network, description, fixed, Path(folder))
+        print(f"traced: {graphs.nodes} nodes, opset {OPSET}, {graphs.bytes / 1e6:.0f} MB")
+        rows = []
+        with console.status("verifying against PyTorch") as status:
+            for row in verify(network, graphs, description, fixed):
+                rows.append(row)
+                status.update(f"verifying against PyTorch: {row.stage}, {row.case}")
+        _print_table(rows)
+        if not all(row.passed for row in rows):
+            return False
+        if out is not None:
+            _say_written(hand_out(graphs.whole, out), out, description)
+        if staged is not None:
+            _write_stages(graphs, staged)
+            _say_written([staged], staged, description)
     return True
 
 
-def _write_stages(traced: "onnx.ModelProto", description: Description, staged: Path) -> None:
+def _write_stages(graphs: "Graphs", staged: Path) -> None:
     """One graph a stage and the manifest, in a folder that appears whole."""
-    import onnx
-
-    from .exporter import stage_graph
-    from .stages import find_stages
+    from .weights import hand_out
 
     temporary = Path(tempfile.mkdtemp(prefix=f".{staged.name}.", dir=staged.parent))
     try:
         files = []
-        for stage in find_stages(traced):
-            graph = stage_graph(traced, stage, description)
-            onnx.checker.check_model(graph, full_check=True)
+        for stage in graphs.stages:
             files.append(StageFile(stage.name, f"{stage.name}.onnx", list(stage.inputs), list(stage.outputs)))
-            (temporary / files[-1].file).write_bytes(graph.SerializeToString())
+            hand_out(graphs.of_stage(stage), temporary / files[-1].file)
         write_manifest(temporary, files)
         temporary.chmod(0o755)
         if staged.exists():
@@ -199,6 +181,15 @@ def _write_stages(traced: "onnx.ModelProto", description: Description, staged: P
         temporary.rename(staged)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _say_written(paths: list[Path], model: Path, description: Description) -> None:
+    """What was written and how to use it."""
+    print("\n".join(f"wrote {path}" for path in paths))
+    if len(paths) > 1:
+        print(f"{paths[1].name} holds the weights: move it along with {model.name}")
+    makes = "a splat" if description.gaussians else "depth and a point cloud"
+    print(f"make {makes} with: idesplat-infer --model {model} --images ... --cameras ... --out scene.ply")
 
 
 def _print_table(rows: "list[Parity]") -> None:

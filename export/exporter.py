@@ -2,7 +2,6 @@
 
 import copy
 import logging
-import tempfile
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,8 @@ import torch
 
 from ..runtime.bundle import INPUTS, METADATA_KEY, OUTPUTS, Description
 from .optimize import simplify
-from .stages import NamedTensors, Stage, example_inputs
+from .stages import NamedTensors, Stage, example_inputs, find_stages
+from .weights import fill_inputs
 
 OPSET = 20
 IR_VERSION = 10
@@ -29,6 +29,8 @@ DYNAMIC = {
     **{name: {0: "gaussians"} for name in OUTPUTS if name != "depth"},
 }
 PRODUCER = "idesplat"
+# Files of the folder that is worked in.
+TRACED, TRACED_WEIGHTS, WEIGHTS, WHOLE = "traced.onnx", "traced.weights", "weights", "whole.onnx"
 
 
 @dataclass(frozen=True)
@@ -39,19 +41,56 @@ class Fixed:
     size: tuple[int, int] | None = None
 
 
-def trace(network: NamedTensors, near: float, far: float, multiple: int, fixed: Fixed) -> onnx.ModelProto:
-    """Export the network with every stage boundary as an output.
+@dataclass(frozen=True)
+class Graphs:
+    """A frozen network: the whole and every stage as files in one folder, where all their weights are one more file."""
+
+    folder: Path
+    stages: list[Stage]
+    # Nodes of the whole.
+    nodes: int
+
+    @property
+    def whole(self) -> Path:
+        """The graph with the network's own outputs alone."""
+        return self.folder / WHOLE
+
+    @property
+    def bytes(self) -> int:
+        """How large the whole is with its weights."""
+        return self.whole.stat().st_size + (self.folder / WEIGHTS).stat().st_size
+
+    def of_stage(self, stage: Stage) -> Path:
+        """The graph between a stage's named tensors."""
+        return self.folder / f"stage.{stage.name}.onnx"
+
+
+def freeze(network: NamedTensors, description: Description, fixed: Fixed, folder: Path) -> Graphs:
+    """Trace a network and cut it into stages, all as files in an empty folder, checked against ONNX's specification."""
+    traced = trace(network, description, fixed, folder)
+    whole = _whole_graph(traced)
+    graphs = Graphs(folder, find_stages(traced, network.stages), len(whole.graph.node))
+    _write(whole, description, graphs.whole)
+    for stage in graphs.stages:
+        _write(_stage_graph(traced, stage), description, graphs.of_stage(stage))
+    return graphs
+
+
+def trace(network: NamedTensors, description: Description, fixed: Fixed, folder: Path) -> onnx.ModelProto:
+    """Export the network with every stage boundary as an output; its weights go to a file in the folder.
 
     torch.onnx's TorchScript path is used on purpose: with views, height and width dynamic, torch.export 2.13 spends
-    minutes reasoning about symbolic shapes even for a network of a tenth of the size.
+    minutes reasoning about symbolic shapes even for a network of a tenth of the size. It is not given the weights,
+    of which it would hold several copies.
     """
+    multiple = description.size_multiple
     views = fixed.views or TRACE_VIEWS
     height, width = fixed.size or (TRACE_BLOCKS[0] * multiple, TRACE_BLOCKS[1] * multiple)
-    inputs = tuple(example_inputs(views, height, width, near, far).values())
-    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings(), torch.no_grad():
+    inputs = tuple(example_inputs(views, height, width, description.near, description.far).values())
+    path, weights = folder / TRACED, folder / TRACED_WEIGHTS
+    with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore")  # deprecation of the path, and tracing warnings on sizes fixed on purpose
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-        path = Path(folder) / "traced.onnx"
         shapes = {name: tuple(tensor.shape) for name, tensor in network.named(*inputs).items()}
         axes = _dynamic_axes(shapes, fixed)
         torch.onnx.export(
@@ -59,12 +98,18 @@ def trace(network: NamedTensors, near: float, far: float, multiple: int, fixed: 
             inputs,
             str(path),
             dynamo=False,
+            export_params=False,
+            do_constant_folding=False,  # weights that it folds lose their names; `simplify` folds them
             opset_version=OPSET,
             input_names=list(INPUTS),
             output_names=list(shapes),
             dynamic_axes=axes,
         )
-        model = simplify(path)
+    traced = onnx.load(path)
+    fill_inputs(traced, [*network.named_parameters(), *network.named_buffers()], weights)
+    path.write_bytes(traced.SerializeToString())
+    model = simplify(path, folder / WEIGHTS)
+    weights.unlink()
     _declare_shapes(model, shapes, axes)
     return model
 
@@ -98,25 +143,24 @@ def _declare_shapes(
         output.CopyFrom(onnx.helper.make_tensor_value_info(output.name, element, dims))
 
 
-def fused_graph(traced: onnx.ModelProto, description: Description) -> onnx.ModelProto:
-    """The traced graph with the network's own outputs alone."""
+def _whole_graph(traced: onnx.ModelProto) -> onnx.ModelProto:
     model = copy.deepcopy(traced)
     outputs = [output for output in model.graph.output if output.name in OUTPUTS]
     del model.graph.output[:]
     model.graph.output.extend(sorted(outputs, key=lambda output: OUTPUTS.index(output.name)))
-    return _finished(model, description)
+    return model
 
 
-def stage_graph(traced: onnx.ModelProto, stage: Stage, description: Description) -> onnx.ModelProto:
-    """One stage cut from the traced graph, between its named tensors."""
-    model = onnx.utils.Extractor(traced).extract_model(list(stage.inputs), list(stage.outputs))
-    return _finished(model, description)
+def _stage_graph(traced: onnx.ModelProto, stage: Stage) -> onnx.ModelProto:
+    return onnx.utils.Extractor(traced).extract_model(list(stage.inputs), list(stage.outputs))
 
 
-def _finished(model: onnx.ModelProto, description: Description) -> onnx.ModelProto:
+def _write(model: onnx.ModelProto, description: Description, path: Path) -> None:
+    """Have a graph say what it is, and save it."""
     model.ir_version = IR_VERSION
     model.producer_name, model.producer_version = PRODUCER, description.version
     model.doc_string = f"{description.preset} exported by idesplat {description.version}"
     del model.metadata_props[:]
     onnx.helper.set_model_props(model, {METADATA_KEY: description.to_json()})
-    return model
+    path.write_bytes(model.SerializeToString())
+    onnx.checker.check_model(str(path), full_check=True)

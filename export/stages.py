@@ -6,17 +6,16 @@ them a later stage reads is not written down anywhere: it is read off the traced
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import onnx
 import torch
 from torch import Tensor, nn
 
-from ..model.depthsplat import DepthSplat
+from ..model.depth_stage import PredictedDepth
 from ..model.gaussian_head import Predicted
-from ..model.idesplat import IDESplat
-from ..runtime.bundle import INPUTS, OUTPUTS
-
-LAST_STAGE = "gaussians"
+from ..model.networks import Network
+from ..runtime.bundle import INPUTS
 
 
 @dataclass(frozen=True)
@@ -31,9 +30,10 @@ class Stage:
 class NamedTensors(nn.Module):
     """The network with everything that its stages yield as outputs, by name."""
 
-    def __init__(self, model: IDESplat | DepthSplat) -> None:
+    def __init__(self, model: Network) -> None:
         super().__init__()
         self.model = model
+        self.stages = [name for name, _ in model.named_children()]
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """The graph's inputs, as `INPUTS` names them -> the tensors of `named`, in its order."""
@@ -42,24 +42,25 @@ class NamedTensors(nn.Module):
     def named(self, *inputs: Tensor) -> dict[str, Tensor]:
         """The fields of every stage before the last, and the network's own outputs."""
         named: dict[str, Tensor] = {}
-        stages = [name for name, _ in self.model.named_children()]
-        for stage, part in zip(stages, self.model.stages(*inputs), strict=True):
+        parts: tuple[Any, ...] = self.model.stages(*inputs)
+        for stage, part in zip(self.stages, parts, strict=True):
             if isinstance(part, Predicted):
                 named |= {"depth": part.depth, **part.gaussians._asdict()}
+            elif isinstance(part, PredictedDepth):
+                named |= {"depth": part.depth}
             else:
                 named |= {f"{stage}.{field}": value for field, value in part._asdict().items()}
         return named
 
 
-def find_stages(traced: onnx.ModelProto) -> list[Stage]:
+def find_stages(traced: onnx.ModelProto, names: list[str]) -> list[Stage]:
     """The stages of a traced graph in the order in which they run, each with what it reads and what is read of it."""
     producers = {output: node for node in traced.graph.node for output in node.output}
     named = [output.name for output in traced.graph.output]
-    fields: dict[str, list[str]] = {}
-    for name in named:
-        fields.setdefault(name.partition(".")[0] if "." in name else LAST_STAGE, []).append(name)
-    needed, stages = set(OUTPUTS), []
-    for stage, own in reversed(fields.items()):
+    results = [name for name in named if "." not in name]  # the last stage's
+    needed, stages = set(results), []
+    for stage in reversed(names):
+        own = results if stage == names[-1] else [name for name in named if name.startswith(f"{stage}.")]
         outputs = [name for name in own if name in needed]
         borders = {*INPUTS, *named} - set(own)
         read = _reached(outputs, borders, producers)

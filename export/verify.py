@@ -2,15 +2,15 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
-import onnx
 import torch
 
 from ..runtime.bundle import OUTPUTS, Description
 from ..runtime.session import open_session, run_session
-from .exporter import Fixed, stage_graph
-from .stages import NamedTensors, example_inputs, find_stages
+from .exporter import Fixed, Graphs
+from .stages import NamedTensors, example_inputs
 
 # Errors are in standard deviations of the tensor. Within a stage both sides start from the same numbers; what is left
 # is float32 rounding, and the few pixels where a projection falls on the border of two and rounds to the other.
@@ -42,49 +42,56 @@ class Parity:
         return self.median <= self.tolerance
 
 
-def verify(
-    network: NamedTensors, traced: onnx.ModelProto, fused: bytes, description: Description, fixed: Fixed
-) -> Iterator[Parity]:
-    """Compare the stages of a traced graph, and the finished fused one, with the network on two shapes."""
-    for views, height, width in _cases(description, fixed):
-        inputs = example_inputs(views, height, width, description.near, description.far)
-        with torch.no_grad():
-            expected = {name: value.numpy() for name, value in network.named(*inputs.values()).items()}
-        feeds = {**expected, **{name: value.numpy() for name, value in inputs.items()}}
-        case = f"{views} views {height}x{width}"
-        for stage in find_stages(traced):
-            session = open_session(stage_graph(traced, stage, description).SerializeToString())
-            found = run_session(session, feeds)
-            yield from _compare(case, stage.name, stage.outputs, found, expected, STAGE_TOLERANCE)
-        found = run_session(open_session(fused), feeds)
-        yield from _compare(case, WHOLE, OUTPUTS, found, expected, WHOLE_TOLERANCE)
+@dataclass(frozen=True)
+class Case:
+    """What the network makes of some views: its inputs and all that its stages yield, by name."""
+
+    name: str
+    tensors: dict[str, np.ndarray]
 
 
-def _cases(description: Description, fixed: Fixed) -> list[tuple[int, int, int]]:
+def verify(network: NamedTensors, graphs: Graphs, description: Description, fixed: Fixed) -> Iterator[Parity]:
+    """Compare the graphs of every stage, and that of the whole, with the network on two shapes."""
+    cases = [_case(network, description, *shape) for shape in _shapes(description, fixed)]
+    for stage in graphs.stages:
+        yield from _verify(graphs.of_stage(stage), stage.name, stage.outputs, cases, STAGE_TOLERANCE)
+    results = [name for name in OUTPUTS if name in cases[0].tensors]
+    yield from _verify(graphs.whole, WHOLE, results, cases, WHOLE_TOLERANCE)
+
+
+def _shapes(description: Description, fixed: Fixed) -> list[tuple[int, int, int]]:
     """Two different numbers of views and sizes, as far as they are not fixed."""
     trained = (description.height, description.width)
     small = (6 * description.size_multiple, 8 * description.size_multiple)
     return [(fixed.views or 2, *(fixed.size or trained)), (fixed.views or 3, *(fixed.size or small))]
 
 
-def _compare(
-    case: str,
-    stage: str,
-    names: Iterable[str],
-    found: dict[str, np.ndarray],
-    expected: dict[str, np.ndarray],
-    tolerance: float,
-) -> Iterator[Parity]:
-    for name in names:
-        if found[name].shape != expected[name].shape:
-            yield Parity(case, stage, name, np.inf, np.inf, tolerance)
-            continue
-        ours = found[name].astype(np.float64)
-        if name == UP_TO_SCALE:
-            ours *= _scale(ours, expected[name])
-        deviation = float(expected[name].std()) or 1.0
-        error = np.abs(ours - expected[name]) / deviation
-        yield Parity(case, stage, name, float(error.max()), float(np.median(error)), tolerance)
+def _case(network: NamedTensors, description: Description, views: int, height: int, width: int) -> Case:
+    inputs = example_inputs(views, height, width, description.near, description.far)
+    with torch.no_grad():
+        tensors = {**inputs, **network.named(*inputs.values())}
+    return Case(f"{views} views {height}x{width}", {name: value.numpy() for name, value in tensors.items()})
+
+
+def _verify(graph: Path, stage: str, names: Iterable[str], cases: list[Case], tolerance: float) -> Iterator[Parity]:
+    """Run one graph on the network's own tensors and compare what it yields under these names."""
+    session = open_session(graph)
+    for case in cases:
+        found = run_session(session, case.tensors)
+        for name in names:
+            largest, median = _errors(name, found[name], case.tensors[name])
+            yield Parity(case.name, stage, name, largest, median, tolerance)
+
+
+def _errors(name: str, found: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
+    """The largest and the median error, in standard deviations of what is expected."""
+    if found.shape != expected.shape:
+        return np.inf, np.inf
+    found = found.astype(np.float64)
+    if name == UP_TO_SCALE:
+        found *= _scale(found, expected)
+    error = np.abs(found - expected) / (float(expected.std()) or 1.0)
+    return float(error.max()), float(np.median(error))
 
 
 def _scale(found: np.ndarray, expected: np.ndarray) -> float:

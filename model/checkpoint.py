@@ -45,10 +45,7 @@ def read_state_dict(path: Path) -> dict[str, Tensor]:
 
     Raises CheckpointError.
     """
-    if not path.is_file():
-        raise CheckpointError(
-            f"{path}: no such file; give the path of a released checkpoint (.ckpt, .pth or .safetensors)"
-        )
+    _check_file(path)
     content = _read_safetensors(path) if path.suffix == ".safetensors" else _read_pickle(path)
     for container in CONTAINERS:
         if isinstance(content, dict) and isinstance(content.get(container), dict):
@@ -68,16 +65,26 @@ def read_state_dict(path: Path) -> dict[str, Tensor]:
     return tensors
 
 
-def name_hash_warning(path: Path) -> str | None:
+def file_sha256(path: Path) -> str:
+    """The SHA-256 of a file in hex digits; raises CheckpointError if there is none."""
+    _check_file(path)
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def name_hash_warning(path: Path, digest: str) -> str | None:
     """A warning, if the file's name holds the beginning of its SHA-256, as released ones do, and it does not match."""
     named = NAMED_HASH.search(path.name)
-    if not named:
-        return None
-    with path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
-    if digest.startswith(named[1]):
+    if not named or digest.startswith(named[1]):
         return None
     return f"{path}: its name says that its SHA-256 begins with {named[1]}, but it begins with {digest[:8]}"
+
+
+def _check_file(path: Path) -> None:
+    if not path.is_file():
+        raise CheckpointError(
+            f"{path}: no such file; give the path of a released checkpoint (.ckpt, .pth or .safetensors)"
+        )
 
 
 def _read_safetensors(path: Path) -> object:

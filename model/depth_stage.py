@@ -25,6 +25,13 @@ class Matched(NamedTuple):
     inverse_depth_full: Tensor
 
 
+class PredictedDepth(NamedTuple):
+    """The result of the network that has no Gaussians, and the scale that it comes from."""
+
+    depth: Tensor  # [views, H, W], metric z-depth
+    scale: Matched
+
+
 class DepthStage(nn.Module):
     """The part that both scales share."""
 

@@ -1,9 +1,16 @@
-"""DepthSplat: posed photographs to depth and Gaussians in one pass."""
+"""DepthSplat: posed photographs to depth and Gaussians in one pass.
+
+Read beside `idesplat.py`. What the two share is written once: CNN, multi-view transformer and ViT (encoder.py), the
+U-Net that regularises costs (unet.py), dense prediction (dpt.py), and Gaussians from depth and raw parameters
+(gaussian_adapter.py). They part where depth is found, here by sweeping planes at one scale or two (depth_stage.py),
+there by attention along epipolar lines, three times over (dpbu.py); and where it is brought to image size, here by DPT
+heads (upsampler.py, gaussian_regressor.py), there by window attention over shuffled pixels (gaussian_head.py).
+"""
 
 from torch import Tensor, nn
 
 from .config import DepthSplatConfig
-from .depth_stage import CoarseDepth, FineDepth, Matched
+from .depth_stage import CoarseDepth, FineDepth, Matched, PredictedDepth
 from .encoder import EncodedPyramid, PyramidEncoder
 from .gaussian_head import Predicted
 from .gaussian_regressor import GaussianRegressor
@@ -54,13 +61,11 @@ class DepthSplat(DepthScales):
         intrinsics: [views, 3, 3], normalised by width and height.
         near, far: [views], in scene units.
         """
-        cameras = Cameras(extrinsics, intrinsics, near, far)
-        encoded, scales = self.depth_stages(images, cameras)
-        return self.gaussians(images, cameras, encoded, scales)
+        return self.stages(images, extrinsics, intrinsics, near, far)[-1]
 
     def stages(
         self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor, near: Tensor, far: Tensor
-    ) -> tuple[EncodedPyramid | Matched | Predicted, ...]:
+    ) -> tuple[EncodedPyramid, *tuple[Matched, ...], Predicted]:
         """What each stage yields, in order, for parity and for training with every stage supervised."""
         cameras = Cameras(extrinsics, intrinsics, near, far)
         encoded, scales = self.depth_stages(images, cameras)
@@ -68,9 +73,17 @@ class DepthSplat(DepthScales):
 
 
 class DepthSplatDepth(DepthScales):
-    """DepthSplat without Gaussians, as the depth-only checkpoints have it."""
+    """DepthSplat without Gaussians, as the depth-only checkpoints have it: the last scale's depth is the result."""
 
-    def forward(self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor, near: Tensor, far: Tensor) -> Tensor:
-        """Arguments as for `DepthSplat` -> metric z-depth [views, H, W]."""
-        _, scales = self.depth_stages(images, Cameras(extrinsics, intrinsics, near, far))
-        return 1 / scales[-1].inverse_depth_full[:, 0]
+    def forward(
+        self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor, near: Tensor, far: Tensor
+    ) -> PredictedDepth:
+        """Predict depth; arguments as for `DepthSplat`."""
+        return self.stages(images, extrinsics, intrinsics, near, far)[-1]
+
+    def stages(
+        self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor, near: Tensor, far: Tensor
+    ) -> tuple[EncodedPyramid, *tuple[Matched, ...], PredictedDepth]:
+        """What each stage yields, in order, for parity and for training with every stage supervised."""
+        encoded, (*before, last) = self.depth_stages(images, Cameras(extrinsics, intrinsics, near, far))
+        return encoded, *before, PredictedDepth(1 / last.inverse_depth_full[:, 0], last)

@@ -1,4 +1,7 @@
-"""IDESplat: posed photographs to depth and Gaussians in one pass."""
+"""IDESplat: posed photographs to depth and Gaussians in one pass.
+
+Read beside `depthsplat.py`, which says what the two share and where they part.
+"""
 
 from torch import Tensor, nn
 

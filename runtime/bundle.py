@@ -42,6 +42,8 @@ class Description:
     checkpoint_sha256: str
     # Version of idesplat that exported it.
     version: str
+    # Whether it yields Gaussians, as all models before this field did, or depth alone.
+    gaussians: bool = True
     conventions: str = CONVENTIONS
     layout: int = LAYOUT
 

@@ -84,6 +84,6 @@ def test_hash_in_the_name(tmp_path):
     for name, fits in ((f"depthsplat-{digest}.pth", True), ("depthsplat-00000000.pth", False), ("mine.pth", True)):
         path = tmp_path / name
         path.write_bytes(b"weights")
-        warning = checkpoint.name_hash_warning(path)
+        warning = checkpoint.name_hash_warning(path, checkpoint.file_sha256(path))
         assert (warning is None) == fits
         assert fits or (digest in warning and "00000000" in warning and str(path) in warning)

@@ -6,7 +6,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from conftest import SMALL, SMALL_PRESET, run_command, small_network
+from conftest import SMALL_PRESET, run_command, small_network
 from idesplat.export import cli
 from idesplat.export.stages import example_inputs
 from idesplat.export.verify import Parity
@@ -121,20 +121,19 @@ def test_a_departing_graph_leaves_no_file(small_checkpoint, presets, tmp_path, m
     assert "DEPARTS" in capsys.readouterr().out
 
 
-def test_verification_notices_a_wrong_graph(exported, small_checkpoint):
+def test_verification_notices_a_wrong_graph(exported, tmp_path):
     """The very comparison that guards the export fails when the weights differ by one part in ten of one tensor."""
-    from idesplat.export.exporter import Fixed, fused_graph, trace
+    from idesplat.export.exporter import Fixed, freeze
     from idesplat.export.stages import NamedTensors
     from idesplat.export.verify import verify
 
     network = NamedTensors(small_network())
-    traced = trace(network, 0.5, 100.0, SMALL.size_multiple, Fixed())
     properties = {entry.key: entry.value for entry in onnx.load(exported[0]).metadata_props}
     description = read_description(properties, exported[0])
-    fused = fused_graph(traced, description).SerializeToString()
+    graphs = freeze(network, description, Fixed(), tmp_path)
     with torch.no_grad():
         network.model.dpbu1.merge.conv.weight *= 1.1
-    rows = list(verify(network, traced, fused, description, Fixed()))
+    rows = list(verify(network, graphs, description, Fixed()))
     assert "dpbu1" in {row.stage for row in rows if not row.passed}
     assert not {row.stage for row in rows if not row.passed} & {"encoder", "dpbu2", "dpbu3", "gaussians"}
 
