@@ -22,12 +22,21 @@ FUSED = "model"
 
 @dataclass(frozen=True)
 class Prediction:
-    """depth: metric z-depth in scene units, float32 [views, height, width]. gaussians: ordered by view, row, column."""
+    """depth: metric z-depth in scene units, float32 [views, height, width].
+
+    gaussians: ordered by view, row, column; None from a depth-only model (`Runner.description.gaussians` is false).
+    """
 
     depth: np.ndarray
-    gaussians: Gaussians
+    gaussians: Gaussians | None
     # Seconds by stage; a fused file is one stage called "model".
     seconds: dict[str, float] = field(default_factory=dict)
+
+    def need_gaussians(self) -> Gaussians:
+        """The Gaussians, for what cannot do without them; raises InputError if there are none."""
+        if self.gaussians is None:
+            raise InputError("this model predicts depth alone; give one that predicts Gaussians, too")
+        return self.gaussians
 
 
 class Runner:
@@ -150,8 +159,11 @@ class Runner:
             values.update(run_session(session, values))
             seconds[stage.name] = time.perf_counter() - started
             values = {name: value for name, value in values.items() if name in keep or len(self._stages) == 1}
-        gaussians = Gaussians(*(values[name] for name in ("means", "scales", "quats", "opacities", "sh")))
-        return Prediction(frame.leave_depth(values["depth"]), frame.leave(gaussians), seconds)
+        gaussians = None
+        if self.description.gaussians:
+            parts = (values[name] for name in ("means", "scales", "quats", "opacities", "sh"))
+            gaussians = frame.leave(Gaussians(*parts))
+        return Prediction(frame.leave_depth(values["depth"]), gaussians, seconds)
 
 
 def _profiled(tuning: Tuning, stage: StageFile) -> Tuning:

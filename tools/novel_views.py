@@ -77,7 +77,7 @@ class Evaluator:
         targets = []
         for view, name in enumerate(case.targets.names):
             truth, valid = case.targets.picture(view), case.targets.valid[view]
-            drawn = draw(prediction.gaussians, case.targets, view, self.nearest_drawn)
+            drawn = draw(prediction.need_gaussians(), case.targets, view, self.nearest_drawn)
             pictures: dict[str, np.ndarray] = {MODEL: drawn.rgb}
             details: dict[str, Any] = {}
             if self.trivial:

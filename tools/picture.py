@@ -34,7 +34,7 @@ def picture(
     count = len(CONTEXT)
     found = runner.predict_arrays(views.images[:count], views.extrinsics[:count], views.intrinsics[:count])
     pixels = views.intrinsics[-1].astype(np.float64) * np.array([width, height, 1.0])[:, None]
-    between = draw_view(found.gaussians, views.extrinsics[-1], pixels, width, height).rgb
+    between = draw_view(found.need_gaussians(), views.extrinsics[-1], pixels, width, height).rgb
     first, second, truth = views.images.transpose(0, 2, 3, 1)
     save_png(out, np.hstack([first, depth_colours(found.depth[0]), between, truth, second]).astype(np.float32))
     print(f"wrote {out}")
