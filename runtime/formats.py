@@ -10,6 +10,7 @@ from typing import NamedTuple
 from .compressed_ply import read_compressed_ply, write_compressed_ply
 from .errors import InputError
 from .gaussians import Gaussians
+from .glb import read_glb, write_glb
 from .ply import read_ply, write_ply
 from .ply_header import has_element
 from .splat import read_splat, write_splat
@@ -41,6 +42,7 @@ FORMATS = {
     ".compressed.ply": SceneFormat(write_compressed_ply, _read_ply),
     ".splat": SceneFormat(write_splat, read_splat),
     ".spz": SceneFormat(write_spz, read_spz),
+    ".glb": SceneFormat(write_glb, read_glb),
 }
 
 
