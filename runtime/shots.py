@@ -56,7 +56,7 @@ def around(gaussians: Gaussians, cameras: Sequence[Camera], degrees: float, fram
     """
     middle = cameras[len(cameras) // 2]
     down = np.mean([camera.extrinsics[:3, 1] for camera in cameras], axis=0)
-    pivot = middle.extrinsics[:3, 3] + _focus(gaussians, middle) * middle.extrinsics[:3, 2]
+    pivot = middle.extrinsics[:3, 3] + focus(gaussians, middle) * middle.extrinsics[:3, 2]
     poses = orbit_extrinsics(middle.extrinsics, pivot, -down, degrees, frames)
     return _frames(poses, middle.K, middle.width, middle.height)
 
@@ -71,8 +71,11 @@ def fitted(camera: Camera, height: int, width: int) -> Camera:
     return Camera(camera.name, width, height, K, camera.extrinsics)
 
 
-def _focus(gaussians: Gaussians, camera: Camera) -> float:
-    """The depth, in world units, at which half of what the camera sees is farther away."""
+def focus(gaussians: Gaussians, camera: Camera) -> float:
+    """The depth, in world units, at which half of what the camera sees is farther away.
+
+    Raises InputError if it sees nothing.
+    """
     factor = FOCUS_SIDE / max(camera.width, camera.height)
     small = fitted(camera, max(round(camera.height * factor), 1), max(round(camera.width * factor), 1))
     drawn = draw_view(gaussians, small.extrinsics, small.K, small.width, small.height)

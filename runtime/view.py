@@ -1,0 +1,108 @@
+"""The command idesplat-view: a splat file in a browser, served on this machine or as one file to send."""
+
+import contextlib
+import webbrowser
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from .cameras import CameraFormat
+from .errors import InputError, exit_on_input_error
+
+if TYPE_CHECKING:
+    from .viewer import Viewpoint
+
+LOOPBACK = "127.0.0.1"
+PORT = 8080
+
+
+@exit_on_input_error
+def view(
+    scene: Annotated[Path, typer.Argument(help="Splat file of any format.", show_default=False)],
+    cameras: Annotated[Path | None, typer.Option(help="Cameras to draw, such as a transforms.json.")] = None,
+    camera_format: Annotated[
+        CameraFormat | None, typer.Option(help="What --cameras is, where that is not recognised.")
+    ] = None,
+    images: Annotated[
+        list[Path] | None, typer.Option(help="Folder, glob or files of the cameras' photographs.", show_default=False)
+    ] = None,
+    more_images: Annotated[list[Path] | None, typer.Argument(hidden=True)] = None,
+    html: Annotated[
+        Path | None, typer.Option(help="Write one .html that opens anywhere, without network, instead of serving.")
+    ] = None,
+    host: Annotated[str, typer.Option(help="Address to serve at; other machines do not see the default.")] = LOOPBACK,
+    port: Annotated[int, typer.Option(help="Port to serve at, 0 for any.", min=0, max=65535)] = PORT,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
+) -> None:
+    """Look at a splat file in the browser, from the first camera, with the cameras and their photographs around it.
+
+    With --images only the cameras of these photographs are drawn. Nothing is fetched from the network.
+    """
+    from .formats import read_scene
+
+    if images and cameras is None:
+        raise InputError("--images: needs the cameras that took them; give --cameras")
+    if html is not None:
+        _check_page(html)
+    gaussians = read_scene(scene)
+    viewpoints = _viewpoints(cameras, camera_format, [*(images or []), *(more_images or [])])
+    if html is None:
+        from .viewer import serving
+
+        with serving(gaussians, viewpoints, host, port) as server, contextlib.suppress(KeyboardInterrupt):
+            address = f"http://{host}:{server.get_port()}"
+            print(f"{len(gaussians):,} Gaussians to look at: {address} (stop with Ctrl-C)", flush=True)
+            if browser:
+                webbrowser.open(address)
+            server.sleep_forever()
+        return
+    from .files import replacing
+    from .viewer import standalone_page
+
+    page = standalone_page(gaussians, viewpoints)
+    with replacing(html) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+    print(f"wrote {html}: {len(gaussians):,} Gaussians, {html.stat().st_size / 1e6:.1f} MB; open it in any browser")
+
+
+def main() -> None:
+    """Entry point of idesplat-view."""
+    typer.run(view)
+
+
+def _check_page(html: Path) -> None:
+    """Find out before the work whether the page can be written."""
+    from .files import check_writable
+
+    if html.suffix.lower() not in (".html", ".htm") or html.is_dir():
+        raise InputError(f"--html {html}: expected a file to write, whose name ends in .html")
+    check_writable(html.parent)
+
+
+def _viewpoints(cameras: Path | None, form: CameraFormat | None, images: list[Path]) -> "list[Viewpoint]":
+    """The cameras of the photographs, with these, without distortion; all cameras where there are no photographs."""
+    from dataclasses import replace
+
+    from .cameras import located, read_cameras, resized
+    from .images import find_images, load_image, undistort
+    from .progress import progress
+    from .viewer import Viewpoint
+    from .views import match
+
+    if cameras is None:
+        return []
+    if not images:
+        return [
+            Viewpoint(replace(camera, distortion=None, fisheye=False), None)
+            for camera in read_cameras(cameras, form=form)
+        ]
+    files = find_images(images)
+    viewpoints = []
+    for file, camera in progress(match(files, read_cameras(cameras, files, form)), "reading photographs"):
+        photograph = load_image(file)
+        with located(str(file)):
+            camera = resized(camera, photograph.shape[1], photograph.shape[0])
+        photograph, camera = undistort(photograph, camera)
+        viewpoints.append(Viewpoint(camera, photograph))
+    return viewpoints
