@@ -8,12 +8,12 @@ and name it in `CameraFormat` and `recognise`; `Camera` itself checks what every
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from importlib import import_module
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from .camera_format import CameraFormat
 from .errors import InputError
 
 RIGID_TOLERANCE = 1e-3  # how far a rotation's singular values may be from 1
@@ -26,18 +26,6 @@ FISHEYE_LENGTH = 4
 START = 4096  # bytes of a file that tell its format
 RE10K_COLUMNS = 19
 COLMAP_PARTS = ("cameras", "images", "frames", "rigs", "points3D")
-
-
-class CameraFormat(StrEnum):
-    """The formats of camera files; each is read by the module `cameras_<name>`."""
-
-    OWN = "own"
-    TRANSFORMS = "transforms"
-    COLMAP = "colmap"
-    RE10K = "re10k"
-    LLFF = "llff"
-    DTU = "dtu"
-    OPENCV = "opencv"
 
 
 @dataclass(frozen=True, eq=False)

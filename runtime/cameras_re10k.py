@@ -18,6 +18,25 @@ from .errors import InputError
 
 def read(path: Path, pictures: Sequence[Path] = ()) -> list[Camera]:
     """Read the file; `pictures` give the frames' size. Raises InputError."""
+    rows = _rows(path)
+    width, height = _size([name for _, name, _ in rows], path.parent, pictures)
+    cameras = []
+    for number, name, values in rows:
+        with located(f"line {number} (frame {name})"):
+            K = calibration(*values[:4] * (width, height, width, height))
+            pose = np.vstack([values[6:].reshape(3, 4), (0, 0, 0, 1)])
+            cameras.append(Camera(name, width, height, K, invert_rigid(pose)))
+    return cameras
+
+
+def timestamps(path: Path) -> list[str]:
+    """The names of the frames, for which no picture is needed; raises InputError."""
+    with located(str(path)):
+        return [name for _, name, _ in _rows(path)]
+
+
+def _rows(path: Path) -> list[tuple[int, str, np.ndarray]]:
+    """For each frame the line's number, the timestamp and the 18 numbers after it."""
     rows = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         words = line.split()
@@ -31,14 +50,7 @@ def read(path: Path, pictures: Sequence[Path] = ()) -> list[Camera]:
             rows.append((number, words[0], np.array(numbers(words[1:]))))
     if not rows:
         raise InputError("holds no frame, expected lines of a timestamp and 18 numbers")
-    width, height = _size([name for _, name, _ in rows], path.parent, pictures)
-    cameras = []
-    for number, name, values in rows:
-        with located(f"line {number} (frame {name})"):
-            K = calibration(*values[:4] * (width, height, width, height))
-            pose = np.vstack([values[6:].reshape(3, 4), (0, 0, 0, 1)])
-            cameras.append(Camera(name, width, height, K, invert_rigid(pose)))
-    return cameras
+    return rows
 
 
 def _size(names: Sequence[str], folder: Path, pictures: Sequence[Path]) -> tuple[int, int]:

@@ -10,18 +10,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from .camera_format import ESTIMATE, CameraFormat
 from .errors import InputError, exit_on_input_error
 from .files import check_writable, make_folder, replacing
-from .sizes import parse_size
 
 if TYPE_CHECKING:
     import numpy as np
 
     from .cleaning import Cleaning
+    from .depth_range import DepthRange
+    from .inputs import Inputs
     from .runner import Prediction, Runner
     from .views import Views
 
-DEFAULT_VIEWS = 2
 # Frames of the path that --render draws from the first view to the last.
 PATH_FRAMES = 24
 CLEANING = "Cleaning (off unless asked for)"
@@ -29,17 +30,37 @@ CLEANING = "Cleaning (off unless asked for)"
 
 @exit_on_input_error
 def infer(
-    images: Annotated[list[Path], typer.Option(help="Folder, glob or files of photographs.", show_default=False)],
-    cameras: Annotated[Path, typer.Option(help="transforms.json, or this project's cameras JSON.", show_default=False)],
+    images: Annotated[
+        list[Path], typer.Option(help="Folder, glob or files of photographs, or a video.", show_default=False)
+    ],
+    cameras: Annotated[
+        str,
+        typer.Option(
+            help="File or folder of cameras (transforms.json, COLMAP, RealEstate10K, LLFF, DTU, OpenCV stereo, our own "
+            "JSON), or `estimate` to find them from the photographs.",
+            metavar="PATH|estimate",
+            show_default=False,
+        ),
+    ],
     out: Annotated[Path, typer.Option(help="Splat file: .ply, .compressed.ply, .splat or .spz.", show_default=False)],
     model: Annotated[Path, typer.Option(help="A .onnx or staged folder of idesplat-export.", show_default=False)],
     more_images: Annotated[list[Path] | None, typer.Argument(hidden=True)] = None,
+    camera_format: Annotated[
+        CameraFormat | None, typer.Option(help="Format of the cameras, where their content does not tell it.")
+    ] = None,
+    focal: Annotated[
+        str | None, typer.Option(help="For `estimate`: focal length in pixels, or on 35 mm film such as 26mm.")
+    ] = None,
     views: Annotated[
-        int, typer.Option(help="How many photographs to use, the best placed ones.", min=2)
-    ] = DEFAULT_VIEWS,
+        int | None,
+        typer.Option(help="How many photographs to use, the best placed ones: 2, or all --frames.", min=2),
+    ] = None,
+    frames: Annotated[
+        str | None, typer.Option(help="Photographs to use: names or numbers from 0, with commas between.")
+    ] = None,
     size: Annotated[str | None, typer.Option(help="HEIGHTxWIDTH to work at instead of the trained size.")] = None,
-    near: Annotated[float | None, typer.Option(help="Nearest depth in scene units instead of the model's.")] = None,
-    far: Annotated[float | None, typer.Option(help="Farthest depth in scene units instead of the model's.")] = None,
+    near: Annotated[float | None, typer.Option(help="Nearest depth in scene units, else found.")] = None,
+    far: Annotated[float | None, typer.Option(help="Farthest depth in scene units, else found.")] = None,
     provider: Annotated[str, typer.Option(help="ONNX Runtime execution provider, such as CPU or CUDA.")] = "CPU",
     save_depth: Annotated[Path | None, typer.Option(help="Folder for depth maps (.png and metric .npz).")] = None,
     render: Annotated[Path | None, typer.Option(help="Folder for views drawn from the result.")] = None,
@@ -69,35 +90,49 @@ def infer(
             rich_help_panel=CLEANING,
         ),
     ] = False,
+    save_cameras: Annotated[
+        Path | None, typer.Option(help="Write the photographs' cameras: our own JSON, or transforms.json if named so.")
+    ] = None,
     timings: Annotated[bool, typer.Option("--timings", help="Print seconds by stage.")] = False,
     json_path: Annotated[Path | None, typer.Option("--json", help="Write a summary as JSON.")] = None,
 ) -> None:
     """Turn posed photographs into a 3D Gaussian splat that every viewer opens."""
+    from .cameras import write_cameras
     from .cleaning import Cleaning
+    from .inputs import Request, read_inputs
+    from .runner import Runner
 
     started = time.perf_counter()
-    _check_outputs(out, save_depth, render, json_path)
+    _check_outputs(out, save_depth, render, json_path, save_cameras)
     _check_range(near, far)
     cleaning = Cleaning(min_opacity, trim_border, trim_edges, min_confidence, merge_duplicates)
-    prepared, runner, taken = _load([*images, *(more_images or [])], cameras, model, provider, views, size)
-    prediction = _predict(prepared, runner, near, far)
+    given = Request([*images, *(more_images or [])], cameras, camera_format, focal, frames, views, size)
+    runner = Runner(model, provider)
+    inputs = read_inputs(given, runner)
+    prepared = inputs.views
+    span = runner.depth_range(prepared, near, far)
+    prediction = _predict(prepared, runner, span)
     cleaned: dict[str, int] = {}
     if cleaning.asked:
         prediction, cleaned = _clean(prediction, prepared, cleaning)
     written = _write(prediction, prepared, out, save_depth, render)
+    if save_cameras is not None:
+        write_cameras(save_cameras, inputs.cameras)
+        written.append(save_cameras)
     seconds = {"load": runner.load_seconds, **prediction.seconds, "total": time.perf_counter() - started}
     if json_path is not None:
-        summary = _summary(prediction, prepared, runner, near, far, seconds, written)
+        summary = _summary(prediction, inputs, cameras, runner, span, seconds, written)
         summary["cleaned"] = {"asked": asdict(cleaning), "left_out": cleaned}
         with replacing(json_path) as temporary:
             temporary.write_text(json.dumps(summary, indent=2) + "\n")
         written.append(json_path)
-    if len(prepared.names) < taken:
-        print(f"{len(prepared.names)} of {taken} photographs used: {', '.join(prepared.names)} (--views for more)")
+    for note in inputs.notes:
+        print(note)
+    print(f"near {span.near:.4g} and far {span.far:.4g}, in the cameras' unit: {span.source}")
     for path in written:
         print(f"wrote {path}")
     print(f"open {out} in any splat viewer (SuperSplat, for one), or draw it with")
-    print(f"    idesplat-render {out} --cameras {cameras} --out DIR")
+    print(f"    idesplat-render {out} --cameras {_cameras_for_drawing(cameras, save_cameras)} --out DIR")
     if timings:
         _print_timings(seconds)
 
@@ -107,12 +142,21 @@ def main() -> None:
     typer.run(infer)
 
 
-def _check_outputs(out: Path, save_depth: Path | None, render: Path | None, json_path: Path | None) -> None:
+def _cameras_for_drawing(cameras: str, save_cameras: Path | None) -> str:
+    """What to give as cameras to draw the result."""
+    if cameras != ESTIMATE:
+        return cameras
+    return str(save_cameras or "CAMERAS.json (which --save-cameras writes)")
+
+
+def _check_outputs(
+    out: Path, save_depth: Path | None, render: Path | None, json_path: Path | None, save_cameras: Path | None
+) -> None:
     """Find out before the work whether the results can be written."""
     from .formats import scene_suffix
 
     scene_suffix(out)
-    for path in (out, json_path):
+    for path in (out, json_path, save_cameras):
         if path is not None:
             if path.is_dir():
                 raise InputError(f"{path}: is a folder, expected a file to write")
@@ -131,28 +175,11 @@ def _check_range(near: float | None, far: float | None) -> None:
         raise InputError(f"--near {near:g} and --far {far:g}: expected near < far")
 
 
-def _load(
-    given: list[Path], camera_file: Path, model: Path, provider: str, views: int, size: str | None
-) -> "tuple[Views, Runner, int]":
-    """Read photographs, cameras and model; the chosen views, and how many photographs there were."""
-    from .cameras import read_cameras
-    from .images import find_images
-    from .runner import Runner
-    from .views import match, prepare
-
-    pairs = match(find_images(given), read_cameras(camera_file))
-    runner = Runner(model, provider)
-    height, width = parse_size(size) if size else runner.size_for([camera for _, camera in pairs])
-    count = min(runner.description.fixed_views or views, len(pairs))
-    runner.check_size(max(count, DEFAULT_VIEWS), height, width)
-    return prepare(pairs, count if len(pairs) > count else None, height, width), runner, len(pairs)
-
-
-def _predict(views: "Views", runner: "Runner", near: float | None, far: float | None) -> "Prediction":
+def _predict(views: "Views", runner: "Runner", span: "DepthRange") -> "Prediction":
     from rich.console import Console
 
     with Console(stderr=True).status("predicting depth and Gaussians"):
-        return runner.predict_arrays(views.images, views.extrinsics, views.intrinsics, near, far)
+        return runner.predict_arrays(views.images, views.extrinsics, views.intrinsics, span.near, span.far)
 
 
 def _clean(prediction: "Prediction", views: "Views", cleaning: "Cleaning") -> "tuple[Prediction, dict[str, int]]":
@@ -229,10 +256,10 @@ def _write_renders(prediction: "Prediction", views: "Views", stems: list[str], f
 
 def _summary(
     prediction: "Prediction",
-    views: "Views",
+    inputs: "Inputs",
+    cameras: str,
     runner: "Runner",
-    near: float | None,
-    far: float | None,
+    span: "DepthRange",
     seconds: dict[str, float],
     written: list[Path],
 ) -> dict[str, Any]:
@@ -241,11 +268,14 @@ def _summary(
     own, depth = runner.description, prediction.depth
     return {
         "model": {"path": str(runner.path), **asdict(own)},
-        "views": views.names,
+        "cameras": cameras,
+        "views": inputs.views.names,
+        "notes": inputs.notes,
         "height": depth.shape[1],
         "width": depth.shape[2],
-        "near": own.near if near is None else near,
-        "far": own.far if far is None else far,
+        "near": span.near,
+        "far": span.far,
+        "near_far_from": span.source,
         "gaussians": len(prediction.gaussians),
         "depth": dict(zip(("smallest", "median", "largest"), np.percentile(depth, (0, 50, 100)).tolist(), strict=True)),
         "seconds": seconds,

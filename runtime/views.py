@@ -117,7 +117,7 @@ def choose_pairs(pairs: Sequence[Pair], count: int) -> tuple[list[Pair], str]:
     between = compare([cameras[index] for index in chosen], distances[chosen])
     i, j = np.array(neighbours(np.stack([cameras[index].extrinsics for index in chosen]))).T
     overlap, parallax = between.overlap[i, j], between.parallax[i, j]
-    angles = f"{parallax.min():.1f}" if len(i) == 1 else f"{parallax.min():.1f} to {parallax.max():.1f}"
+    angles = " to ".join(dict.fromkeys(f"{angle:.1f}" for angle in (parallax.min(), parallax.max())))
     choice = (
         f"neighbours share at least {100 * overlap.min():.0f} % of their view, {angles} degrees apart as seen from the "
         f"scene, which is {np.median(distances[chosen]):.3g} away by {source}"

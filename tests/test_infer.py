@@ -8,10 +8,12 @@ import cv2
 import numpy as np
 import pytest
 from conftest import run_command
+from idesplat.runtime.cameras import read_cameras
 from idesplat.runtime.cli import main
 from idesplat.runtime.formats import read_scene
 from idesplat.runtime.ply import read_ply
 from idesplat.runtime.render import main as render_main
+from idesplat.tools.make_scene import make_scene
 
 
 @pytest.fixture
@@ -27,7 +29,7 @@ def workplace(scene, exported, tmp_path, monkeypatch):
 USUAL = ("--images", "images", "--cameras", "transforms.json", "--model", "model.onnx", "--out", "scene.ply")
 
 
-def test_everything_it_can_write(workplace, capsys):
+def test_everything_it_can_write(workplace, scene, capsys):
     extras = ("--save-depth", "depth", "--render", "views", "--timings", "--json", "summary.json", "--views", "3")
     assert run_command(main, *USUAL, *extras) == 0
     gaussians = read_ply(Path("scene.ply"))
@@ -37,7 +39,10 @@ def test_everything_it_can_write(workplace, capsys):
     assert summary["gaussians"] == len(gaussians)
     assert len(summary["views"]) == 3
     assert summary["model"]["preset"] == "idesplat-small"
-    assert (summary["near"], summary["far"]) == (0.5, 100.0)
+    true_depth = np.stack([np.load(path)["depth"] for path in (scene / "depth").iterdir()])
+    assert 0.3 * true_depth.min() < summary["near"] < np.median(true_depth) < summary["far"] < 4 * true_depth.max()
+    assert "points matched between the photographs" in summary["near_far_from"]
+    assert "3 of 5 photographs used" in summary["notes"][0] and "degrees apart" in summary["notes"][0]
     depths = sorted(Path("depth").glob("*.npz"))
     assert len(depths) == len(list(Path("depth").glob("*.png"))) == 3
     with np.load(depths[0]) as file:
@@ -48,6 +53,7 @@ def test_everything_it_can_write(workplace, capsys):
     assert len(frames) == 24
     assert cv2.imread(str(frames[0])).shape == (64, 96, 3)
     printed = capsys.readouterr().out
+    assert f"near {summary['near']:.4g} and far {summary['far']:.4g}" in printed
     for text in ("wrote scene.ply", "wrote summary.json", "3 of 5 photographs", "idesplat-render scene.ply", "total"):
         assert text in printed
 
@@ -82,6 +88,59 @@ def test_what_it_writes_can_be_rendered(workplace):
     assert run_command(render_main, "scene.ply", "--cameras", "transforms.json", "--out", "drawn") == 0
     names = {path.stem for path in Path("images").iterdir()}
     assert {path.stem for path in Path("drawn").glob("*.png")} == names
+
+
+def test_chosen_frames_and_cameras_written(workplace, capsys):
+    assert run_command(main, *USUAL, "--frames", "003,1", "--save-cameras", "used.json", "--json", "s.json") == 0
+    assert json.loads(Path("s.json").read_text())["views"] == ["003.png", "001.png"]
+    known = {camera.name: camera for camera in read_cameras(Path("transforms.json"))}
+    for camera in read_cameras(Path("used.json")):
+        np.testing.assert_allclose(camera.extrinsics, known[camera.name].extrinsics, atol=1e-12)
+    assert "photographs used" not in capsys.readouterr().out
+
+
+def test_cameras_of_another_format_give_the_same(workplace):
+    given = (*USUAL, "--frames", "0,2", "--near", "1", "--far", "20")
+    assert run_command(main, *given) == 0
+    expected = read_ply(Path("scene.ply"))
+    known = {camera.name: camera for camera in read_cameras(Path("transforms.json"))}
+    lines = ["video"]
+    for name, camera in known.items():
+        Path(name).rename(Path(name).with_name(f"7{Path(name).name}"))  # timestamps do not begin with 0
+        focals = camera.K[[0, 1, 0, 1], [0, 1, 2, 2]] / np.array([camera.width, camera.height] * 2)
+        values = [*focals, 0, 0, *np.linalg.inv(camera.extrinsics)[:3].flat]
+        lines.append(" ".join(map(str, [f"7{Path(name).stem}", *values])))
+    Path("trajectory.txt").write_text("\n".join(lines))
+    assert run_command(main, *given, "--cameras", "trajectory.txt") == 0
+    close = np.abs(read_ply(Path("scene.ply")).means - expected.means).max(axis=1) < 1e-3
+    assert close.mean() > 0.99
+    assert run_command(main, *given, "--cameras", "trajectory.txt", "--camera-format", "llff") == 2
+
+
+def test_photographs_alone(workplace, tmp_path_factory, capsys):
+    folder = tmp_path_factory.mktemp("larger")
+    make_scene(folder, seed=2, views=2, height=240, width=320)
+    focal = str(read_cameras(folder / "transforms.json")[0].K[0, 0])
+    given = ("--images", folder / "images", "--model", "model.onnx", "--out", "scene.ply", "--cameras", "estimate")
+    assert run_command(main, *given, "--focal", focal, "--save-cameras", "found.json") == 0
+    printed = capsys.readouterr().out
+    assert "cameras of 2 photographs estimated by OpenCV" in printed and "unit is the median depth" in printed
+    assert "what the cameras are known to see" in printed and "--cameras found.json" in printed
+    assert len(read_ply(Path("scene.ply"))) == 2 * 64 * 96
+    assert run_command(render_main, "scene.ply", "--cameras", "found.json", "--out", "drawn") == 0
+    Path("scene.ply").unlink()
+    assert run_command(main, *given) == 2  # no focal length
+    assert not Path("scene.ply").exists()
+
+
+def test_a_video_with_cameras_that_name_its_frames(workplace):
+    video = cv2.VideoWriter("clip.avi", cv2.VideoWriter_fourcc(*"MJPG"), 30, (128, 96))
+    for path in sorted(Path("images").iterdir()):
+        video.write(cv2.imread(str(path)))
+    video.release()
+    change_cameras(lambda c: [frame.update(file_path=f"clip-{i:06}.png") for i, frame in enumerate(c["frames"])])()
+    assert run_command(main, *USUAL[2:], "--images", "clip.avi", "--frames", "0,4", "--save-cameras", "used.json") == 0
+    assert [camera.name for camera in read_cameras(Path("used.json"))] == ["clip-000000.png", "clip-000004.png"]
 
 
 def change_cameras(edit):
@@ -130,6 +189,11 @@ BAD = {
         "camera",
     ),
     "more images than cameras": (change_cameras(lambda c: c["frames"].pop()), (), "004"),
+    "a frame that is not there": (nothing, ("--frames", "000,9"), "--frames 9: no image is called so"),
+    "a frame twice": (nothing, ("--frames", "000,0"), "names an image twice"),
+    "too few frames": (nothing, ("--frames", "2"), "expected at least 2"),
+    "a video that is none": (lambda: Path("a.mp4").write_bytes(b"hello"), ("--images", "a.mp4"), "a.mp4"),
+    "cameras of another format": (nothing, ("--camera-format", "colmap"), "COLMAP"),
     "a size it cannot take": (nothing, ("--size", "64x50"), "multiples of 16"),
     "a size that is none": (nothing, ("--size", "large"), "HEIGHTxWIDTH"),
     "near behind far": (nothing, ("--near", "5", "--far", "2"), "near < far"),

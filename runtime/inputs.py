@@ -1,0 +1,136 @@
+"""What idesplat-infer is given, brought together: photographs or a video, their cameras or none, views and size."""
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from . import video
+from .camera_format import ESTIMATE, CameraFormat
+from .cameras import Camera, read_cameras, recognise
+from .cameras_re10k import timestamps
+from .errors import InputError
+from .images import find_images, stem
+from .runner import Runner
+from .sizes import parse_size
+from .view_choice import FEWEST_VIEWS
+from .views import Views, match, prepare
+
+DEFAULT_VIEWS = 2
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the user asked for, in the words of the options."""
+
+    images: list[Path]
+    cameras: str
+    camera_format: CameraFormat | None
+    focal: str | None
+    frames: str | None
+    views: int | None
+    size: str | None
+
+
+@dataclass(frozen=True, eq=False)
+class Inputs:
+    """What the network takes, and how it came about.
+
+    views: the chosen photographs with their cameras. cameras: those of all photographs. notes: lines for the user.
+    """
+
+    views: Views
+    cameras: list[Camera]
+    notes: list[str]
+
+
+def read_inputs(request: Request, runner: Runner) -> Inputs:
+    """Read photographs and cameras, or estimate these, choose the views and bring them to the model's size.
+
+    Raises InputError for whatever cannot be used.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        images = _find_pictures(request, Path(folder))
+        notes = []
+        if request.cameras == ESTIMATE:
+            from .estimate import estimate_cameras
+
+            images = pick_frames(images, request.frames)
+            cameras = estimate_cameras(images, request.focal)
+            notes.append(_estimated(len(images), cameras))
+            images = [Path(camera.name) for camera in cameras]
+        else:
+            cameras = read_cameras(Path(request.cameras), images, request.camera_format)
+            images = pick_frames(images, request.frames)
+        pairs = match(images, cameras)
+        own = [camera if path.parent != Path(folder) else replace(camera, name=path.name) for path, camera in pairs]
+        height, width = parse_size(request.size) if request.size else runner.size_for(own)
+        count = min(_wanted(request, runner) or len(pairs), len(pairs))
+        runner.check_size(max(count, FEWEST_VIEWS), height, width)
+        views = prepare(pairs, count, height, width)
+    if views.choice:
+        notes.append(
+            f"{count} of {len(pairs)} photographs used: {', '.join(views.names)}; {views.choice} "
+            "(--views for more, --frames to choose)"
+        )
+    return Inputs(views, own, notes)
+
+
+def pick_frames(images: Sequence[Path], frames: str | None) -> list[Path]:
+    """The images that --frames names, in its order: names with or without suffix, or numbers counted from 0.
+
+    Raises InputError for what is none of the images.
+    """
+    if frames is None:
+        return list(images)
+    picked = []
+    for word in (word.strip() for word in frames.split(",")):
+        named = [image for image in images if word in (image.name, stem(image))]
+        if not named and word.isdecimal() and int(word) < len(images):
+            named = [images[int(word)]]
+        if len(named) != 1:
+            problem = f"{len(named)} of the {len(images)} images are called so" if named else "no image is called so"
+            raise InputError(
+                f"--frames {word}: {problem}; expected names such as {images[0].name}, or numbers from 0 to "
+                f"{len(images) - 1}, with commas between"
+            )
+        picked += named
+    if len(set(picked)) < len(picked):
+        raise InputError(f"--frames {frames}: names an image twice, expected each once")
+    return picked
+
+
+def _find_pictures(request: Request, folder: Path) -> list[Path]:
+    """The images given, or frames of a video, written to `folder`."""
+    videos = [path for path in request.images if video.is_video(path)]
+    if not videos:
+        return find_images(request.images)
+    if len(request.images) > 1:
+        raise InputError(f"{videos[0]}: a video and {len(request.images) - 1} other images given, expected it alone")
+    if request.cameras == ESTIMATE:
+        return video.sample_frames(videos[0], folder)
+    return video.named_frames(videos[0], _names(Path(request.cameras), request.camera_format), folder)
+
+
+def _names(cameras: Path, camera_format: CameraFormat | None) -> list[str]:
+    """The pictures that a file of cameras names, before any picture is there."""
+    if (camera_format or recognise(cameras)) is CameraFormat.RE10K:
+        return timestamps(cameras)
+    return [camera.name for camera in read_cameras(cameras, (), camera_format)]
+
+
+def _wanted(request: Request, runner: Runner) -> int | None:
+    """How many views to use; None for all."""
+    fixed = runner.description.fixed_views
+    if fixed:
+        return fixed
+    return request.views or (None if request.frames else DEFAULT_VIEWS)
+
+
+def _estimated(photographs: int, cameras: Sequence[Camera]) -> str:
+    by = "OpenCV" if photographs == FEWEST_VIEWS else "COLMAP's mapper"
+    left = f", {photographs - len(cameras)} could not be placed" if len(cameras) < photographs else ""
+    return (
+        f"cameras of {len(cameras)} photographs estimated by {by}{left}; the first is the world's origin, and the unit "
+        "is the median depth of what they see, since photographs do not know their scale"
+    )
