@@ -46,7 +46,7 @@ FISHEYE = {
     "OPENCV_FISHEYE": (*FOCALS, "k1", "k2", "k3", "k4"),
 }
 
-DEPTHS_USED = 4000  # of one image
+DEPTHS_USED = 500  # of one image, at least
 COUNT_BYTES, SMALLEST_RECORD = 8, 8
 SECONDS, SECONDS_PER_MB = 20, 2
 MEMORY, MEMORY_PER_BYTE = 4 << 30, 40
@@ -170,9 +170,11 @@ def describe(reconstruction: "pycolmap.Reconstruction") -> list[dict[str, Any]]:
 
 def observed_depths(reconstruction: "pycolmap.Reconstruction", image: "pycolmap.Image") -> np.ndarray:
     """Depths of the points that an image observes, or of some of them, [points]."""
-    observed = [point.point3D_id for point in image.get_observation_points2D()]
+    observed = image.get_observation_point2D_idxs()
     observed = observed[:: max(1, len(observed) // DEPTHS_USED)]
-    points = np.array([reconstruction.point3D(identity).xyz for identity in observed]).reshape(-1, 3)
+    points = np.array([reconstruction.point3D(image.point2D(index).point3D_id).xyz for index in observed]).reshape(
+        -1, 3
+    )
     matrix = image.cam_from_world().matrix()  # [3, 4]
     return points @ matrix[2, :3] + matrix[2, 3]
 

@@ -63,6 +63,8 @@ def read_inputs(request: Request, runner: Runner) -> Inputs:
             cameras = read_cameras(Path(request.cameras), images, request.camera_format)
             images = pick_frames(images, request.frames)
         pairs = match(images, cameras)
+        if request.frames is None and len(cameras) > len(pairs):
+            notes.append(f"{len(cameras) - len(pairs)} of {len(cameras)} cameras have no photograph among those given")
         own = [camera if path.parent != Path(folder) else replace(camera, name=path.name) for path, camera in pairs]
         height, width = parse_size(request.size) if request.size else runner.size_for(own)
         count = min(_wanted(request, runner) or len(pairs), len(pairs))

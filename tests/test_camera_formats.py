@@ -151,6 +151,24 @@ def test_colmap_layouts(tmp_path, layout):
         assert 0.4 * min(depths) < near < min(depths) and max(depths) < far < 3 * max(depths)
 
 
+def test_colmap_rig_of_two_cameras(tmp_path):
+    """A pose of the second camera is the rig's pose, then its place in the rig."""
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 2, 3
+    options.num_points3D = 40
+    reconstruction = pycolmap.synthesize_dataset(options)
+    reconstruction.write(tmp_path)
+    (rig,) = reconstruction.rigs.values()
+    read = {camera.name: camera for camera in read_cameras(tmp_path)}
+    assert len(read) == 6
+    for image in reconstruction.images.values():
+        place = np.vstack([image.frame.rig_from_world.matrix(), (0, 0, 0, 1)])
+        if not rig.is_ref_sensor(image.data_id.sensor_id):
+            place = np.vstack([rig.sensor_from_rig(image.data_id.sensor_id).matrix(), (0, 0, 0, 1)]) @ place
+        np.testing.assert_allclose(inverse(read[image.name]), place, rtol=0, atol=TOLERANCE)
+
+
 def test_colmap_from_its_documentation(tmp_path):
     (tmp_path / "cameras.txt").write_text("# Camera list\n1 OPENCV 640 480 500 501 320.5 240.5 0.1 0.2 0.3 0.4\n")
     # A quarter turn about y: w2c takes the world's z to x. IMAGE_ID, QW QX QY QZ, TX TY TZ, CAMERA_ID, NAME, points.

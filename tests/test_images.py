@@ -242,6 +242,21 @@ def test_what_the_lens_saw_against_opencv_projection():
     assert seen_by_lens(replace(camera, distortion=None)).all()
 
 
+def test_undistort_fisheye_against_opencv_projection():
+    K = np.array([[250.0, 0, 300.3], [0, 253.0, 260.7], [0, 0, 1]])
+    distortion = (0.05, -0.01, 0.004, -0.001)
+    camera = Camera("a", 620, 500, K, np.eye(4), distortion, fisheye=True)
+    opencv_K = K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # pixel centres at whole numbers
+    points = POINTS[:, None]
+    seen = cv2.fisheye.projectPoints(points, np.zeros(3), np.zeros(3), opencv_K, np.array(distortion))[0][:, 0] + 0.5
+    straight, pinhole = undistort(blobs(500, 620, seen, 3), camera)
+    assert pinhole.distortion is None and not pinhole.fisheye and pinhole.K is camera.K
+    expected = project(K)
+    assert np.abs(expected - seen).max() > 1  # the lens does something
+    for centre in expected:
+        np.testing.assert_allclose(centroid(straight[..., 0], centre, 13), centre, atol=1 / 32)
+
+
 def test_undistort_without_distortion_changes_nothing():
     camera = Camera("a", 8, 6, np.array([[9.0, 0, 4], [0, 9, 3], [0, 0, 1]]), np.eye(4))
     image = np.zeros((6, 8, 3), np.uint8)
