@@ -15,6 +15,7 @@ from idesplat.runtime import Gaussians, Runner, rasterize, read_cameras, runner
 from idesplat.runtime.images import find_images, fit, load_image
 from idesplat.runtime.views import match
 from idesplat.tools import evaluate
+from idesplat.tools.cases import procedural_case
 from idesplat.tools.chunks import Entry, chunk_cases
 from idesplat.tools.evaluate import main
 from idesplat.tools.scene_cases import load_case
@@ -159,7 +160,16 @@ def test_procedural_scenes_have_true_depth(workplace: Path, opened: Runner, caps
     assert content["mean"]["model"]["abs_rel"] == pytest.approx(error.mean(), rel=1e-5)
     assert content["mean"]["model"]["within_5_percent"] == pytest.approx((error < 0.05).mean())
     assert set(content["mean"]) == {"model", "nearest", "plane"}
-    assert "1 held-out procedural scenes, 3 views, 64x96" in capsys.readouterr().out
+    assert "1 held-out procedural scenes, 3 of 3 views, 64x96" in capsys.readouterr().out
+
+
+def test_fewer_views_of_the_same_scene() -> None:
+    """The targets stay, and of four views the first and the last are left."""
+    seed, shape = HELD_OUT_SEEDS[0], (32, 48)
+    all_four, two = (procedural_case(seed, count, 4, 1, *shape) for count in (4, 2))
+    np.testing.assert_array_equal(two.targets.images, all_four.targets.images)
+    np.testing.assert_array_equal(two.context.extrinsics, all_four.context.extrinsics[[0, 3]])
+    np.testing.assert_array_equal(two.depth, all_four.depth[[0, 3]])
 
 
 def test_lpips_takes_its_place_beside_the_others(workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -214,6 +224,7 @@ BAD = {
     "an index of longer scenes": (index({"a": {"context": [0, 9], "target": [2]}}), CHUNKS, "has 5 frames"),
     "a damaged chunk": (lambda: Path("chunks/000000.torch").write_bytes(b"x"), CHUNKS, "000000.torch"),
     "one frame of context in the index": (index({"a": {"context": [0], "target": [2]}}), CHUNKS, "1 cannot be used"),
+    "fewer views drawn than given": (nothing, (*PROCEDURAL, "--drawn", "1"), "expected at least the 2"),
     "procedural scenes of a size it cannot take": (nothing, (*PROCEDURAL, "--size", "20x20"), "multiples of 16"),
 }
 

@@ -51,13 +51,17 @@ class Case:
     depth: np.ndarray | None = None
 
 
-def procedural_case(seed: int, context: int, targets: int, height: int, width: int) -> Case:
-    """The procedural scene of `seed`, with exact depth; the same arguments give the same case."""
+def procedural_case(seed: int, context: int, drawn: int, targets: int, height: int, width: int) -> Case:
+    """The procedural scene of `seed`, with exact depth; the same arguments give the same case.
+
+    Of `drawn` context views along a path, `context` are given to the network: the first, the last, and evenly between.
+    """
     from .scenes import draw_sample
 
-    sample = draw_sample(seed, context, targets, height, width)
+    sample = draw_sample(seed, drawn, targets, height, width)
+    given = np.linspace(0, drawn - 1, context).round().astype(int)
 
-    def posed(kind: str, views: slice) -> Posed:
+    def posed(kind: str, views: np.ndarray | slice) -> Posed:
         images = sample.images[views]
         names = [f"{kind}{index}" for index in range(len(images))]
         valid = np.ones((len(images), height, width), bool)
@@ -65,9 +69,9 @@ def procedural_case(seed: int, context: int, targets: int, height: int, width: i
 
     return Case(
         str(seed),
-        posed("context", slice(context)),
-        posed("target", slice(context, None)),
+        posed("context", given),
+        posed("target", slice(drawn, None)),
         sample.near,
         sample.far,
-        sample.depth[:context],
+        sample.depth[given],
     )

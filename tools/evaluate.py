@@ -138,6 +138,10 @@ def procedural(
         int, typer.Option(help="How many of the held-out scenes.", min=1, max=HELD_OUT_SCENES)
     ] = HELD_OUT_SCENES,
     views: Annotated[int, typer.Option(help="Context views of each scene.", min=2, max=8)] = 2,
+    drawn: Annotated[
+        int | None,
+        typer.Option(help="Context views there are, of which --views are given, to compare numbers of views."),
+    ] = None,
     size: Size = None,
 ) -> None:
     """Evaluate on the held-out procedural scenes: depth against the truth, and novel views (extra `eval`)."""
@@ -154,11 +158,14 @@ def procedural(
     runner = _runner(model, out)
     shape = parse_size(size) if size else (runner.description.height, runner.description.width)
     runner.check_size(views, *shape)
-    cases = (procedural_case(seed, views, TARGETS, *shape) for seed in HELD_OUT_SEEDS[:scenes])
+    drawn = views if drawn is None else drawn
+    if drawn < views:
+        raise InputError(f"--drawn {drawn}: expected at least the {views} of --views")
+    cases = (procedural_case(seed, views, drawn, TARGETS, *shape) for seed in HELD_OUT_SEEDS[:scenes])
     results = _evaluate(cases, scenes, Evaluator(runner, load_lpips()), out, PICTURED)
     means = mean_of_scenes(results)
-    print_means(means, f"{scenes} held-out procedural scenes, {views} views, {_by(shape)}")
-    _write(out, {"command": "procedural", "views": views, "size": shape}, runner, means, results)
+    print_means(means, f"{scenes} held-out procedural scenes, {views} of {drawn} views, {_by(shape)}")
+    _write(out, {"command": "procedural", "views": views, "drawn": drawn, "size": shape}, runner, means, results)
 
 
 def main() -> None:
