@@ -140,7 +140,7 @@ def procedural(
     views: Annotated[int, typer.Option(help="Context views of each scene.", min=2, max=8)] = 2,
     drawn: Annotated[
         int | None,
-        typer.Option(help="Context views there are, of which --views are given, to compare numbers of views."),
+        typer.Option(help="Context views there are, of which --views are given; to compare."),
     ] = None,
     size: Size = None,
 ) -> None:
