@@ -16,7 +16,7 @@ def convert(
 ) -> None:
     """Write a splat file in another format, which follows from the file's name.
 
-    .ply, .compressed.ply, .splat and .spz are read and written. What a format cannot hold is named.
+    .ply, .compressed.ply, .splat, .spz, .sog and .glb are read and written. What a format cannot hold is named.
     """
     from .files import check_writable
     from .formats import read_scene, scene_suffix, write_scene

@@ -8,6 +8,10 @@ from pathlib import Path
 
 from .errors import InputError
 
+# Compression reaches ratios of 1000, but no scene comes near these: what claims more would only fill the memory.
+MOST_EXPANSION = 64
+ALWAYS_ALLOWED = 1 << 26  # bytes
+
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
@@ -40,6 +44,14 @@ def read_bytes(path: Path, expected: str) -> bytes:
         return Path(path).read_bytes()
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}; expected {expected}") from None
+
+
+def check_expansion(path: Path, unpacked: int, packed: int) -> None:
+    """Refuse a compressed file of `packed` bytes that claims to hold so much more, before it is unpacked."""
+    if unpacked > max(ALWAYS_ALLOWED, MOST_EXPANSION * packed):
+        raise InputError(
+            f"{path}: {packed} bytes that claim to hold {unpacked} are no scene; copy or download it again"
+        )
 
 
 def make_folder(path: Path) -> Path:

@@ -13,6 +13,7 @@ from .gaussians import Gaussians
 from .glb import read_glb, write_glb
 from .ply import read_ply, write_ply
 from .ply_header import has_element
+from .sog import read_sog, write_sog
 from .splat import read_splat, write_splat
 from .spz import read_spz, write_spz
 
@@ -42,6 +43,7 @@ FORMATS = {
     ".compressed.ply": SceneFormat(write_compressed_ply, _read_ply),
     ".splat": SceneFormat(write_splat, read_splat),
     ".spz": SceneFormat(write_spz, read_spz),
+    ".sog": SceneFormat(write_sog, read_sog),
     ".glb": SceneFormat(write_glb, read_glb),
 }
 

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .errors import refuse
-from .files import read_bytes, replacing
+from .files import check_expansion, read_bytes, replacing
 from .frames import OPENGL, half_turned
 from .gaussians import SH_0, Gaussians, check_finite, check_ranges
 from .quantization import moved, to_bytes
@@ -38,10 +38,6 @@ COLOUR_STEPS = 0.15 * 255  # byte = sh * steps + 127.5: the range is wider than 
 SH_STEPS = 128  # byte = sh * 128 + 128
 SH_HIGHEST = 127.5 / 128  # rounded, the highest byte
 QUAT_STEPS = 511 / np.sqrt(0.5)  # magnitude of a smallest part in 9 bits; the tenth is its sign
-
-# zlib reaches a ratio of 1000, and no scene comes near this one: what claims more is no scene.
-MOST_EXPANSION = 64
-ALWAYS_ALLOWED = 1 << 26  # bytes
 
 
 def write_spz(path: Path, gaussians: Gaussians) -> list[str]:
@@ -124,8 +120,7 @@ def _inflate(path: Path, content: bytes) -> tuple[_Header, bytes]:
     try:
         header = _read_header(path, inflater.decompress(content, HEADER.size))
         size = header.gaussians * sum(_sizes(header))
-        if size > max(ALWAYS_ALLOWED, MOST_EXPANSION * len(content)):
-            refuse(path, f"{header.gaussians} Gaussians cannot be in {len(content)} bytes", "copy or download it again")
+        check_expansion(path, size, len(content))
         body = inflater.decompress(inflater.unconsumed_tail, size) if size else b""
         beyond = inflater.decompress(inflater.unconsumed_tail, 1)  # at the end, zlib compares the checksum
     except zlib.error:
