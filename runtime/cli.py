@@ -15,6 +15,8 @@ from .errors import InputError, exit_on_input_error
 from .files import check_writable, make_folder, replacing
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import numpy as np
 
     from .cleaning import Cleaning
@@ -93,6 +95,9 @@ def infer(
     save_cameras: Annotated[
         Path | None, typer.Option(help="Write the photographs' cameras: our own JSON, or transforms.json if named so.")
     ] = None,
+    report: Annotated[
+        Path | None, typer.Option(help="Write one .html that shows views, depth, confidence, timings and settings.")
+    ] = None,
     timings: Annotated[bool, typer.Option("--timings", help="Print seconds by stage.")] = False,
     json_path: Annotated[Path | None, typer.Option("--json", help="Write a summary as JSON.")] = None,
 ) -> None:
@@ -103,7 +108,7 @@ def infer(
     from .runner import Runner
 
     started = time.perf_counter()
-    _check_outputs(out, save_depth, render, json_path, save_cameras)
+    _check_outputs(out, (json_path, save_cameras, report), (save_depth, render))
     _check_range(near, far)
     cleaning = Cleaning(min_opacity, trim_border, trim_edges, min_confidence, merge_duplicates)
     given = Request([*images, *(more_images or [])], cameras, camera_format, focal, frames, views, size)
@@ -120,9 +125,15 @@ def infer(
         write_cameras(save_cameras, inputs.cameras)
         written.append(save_cameras)
     seconds = {"load": runner.load_seconds, **prediction.seconds, "total": time.perf_counter() - started}
+    summary = _summary(prediction, inputs, cameras, runner, span, seconds, written)
+    summary["cleaned"] = {"asked": asdict(cleaning), "left_out": cleaned}
+    if report is not None:
+        from .inference_report import write_report
+
+        write_report(report, prediction.depth, prediction.gaussians, prepared, summary)
+        written.append(report)
+        summary["files"].append(str(report))
     if json_path is not None:
-        summary = _summary(prediction, inputs, cameras, runner, span, seconds, written)
-        summary["cleaned"] = {"asked": asdict(cleaning), "left_out": cleaned}
         with replacing(json_path) as temporary:
             temporary.write_text(json.dumps(summary, indent=2) + "\n")
         written.append(json_path)
@@ -131,8 +142,12 @@ def infer(
     print(f"near {span.near:.4g} and far {span.far:.4g}, in the cameras' unit: {span.source}")
     for path in written:
         print(f"wrote {path}")
-    print(f"open {out} in any splat viewer (SuperSplat, for one), or draw it with")
-    print(f"    idesplat-render {out} --cameras {_cameras_for_drawing(cameras, save_cameras)} --out DIR")
+    known = _cameras_for_drawing(cameras, save_cameras)
+    print(f"open {out} in any splat viewer (SuperSplat, for one), look at it in the browser, or draw it:")
+    print(f"    idesplat-view {out} --cameras {known}")
+    print(f"    idesplat-render {out} --cameras {known} --out DIR")
+    if report is not None:
+        print(f"open {report} in any browser")
     if timings:
         _print_timings(seconds)
 
@@ -143,25 +158,23 @@ def main() -> None:
 
 
 def _cameras_for_drawing(cameras: str, save_cameras: Path | None) -> str:
-    """What to give as cameras to draw the result."""
+    """What to give as cameras to look at the result."""
     if cameras != ESTIMATE:
         return cameras
     return str(save_cameras or "CAMERAS.json (which --save-cameras writes)")
 
 
-def _check_outputs(
-    out: Path, save_depth: Path | None, render: Path | None, json_path: Path | None, save_cameras: Path | None
-) -> None:
+def _check_outputs(out: Path, files: "Sequence[Path | None]", folders: "Sequence[Path | None]") -> None:
     """Find out before the work whether the results can be written."""
     from .formats import scene_suffix
 
     scene_suffix(out)
-    for path in (out, json_path, save_cameras):
+    for path in (out, *files):
         if path is not None:
             if path.is_dir():
                 raise InputError(f"{path}: is a folder, expected a file to write")
             check_writable(path.parent)
-    for folder in (save_depth, render):
+    for folder in folders:
         if folder is not None:
             check_writable(make_folder(folder))
 

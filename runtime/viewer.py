@@ -66,7 +66,8 @@ def serving(
             _add_viewpoint(server, index, view, first.extrinsics[:3, 3], unit)
         yield server
     finally:
-        server.stop()
+        with _quiet():
+            server.stop()
 
 
 def standalone_page(gaussians: Gaussians, viewpoints: Sequence[Viewpoint]) -> str:
@@ -89,10 +90,15 @@ def _start(host: str, port: int) -> "viser.ViserServer":
         with socket.create_server((host, port)):
             pass
     except (OSError, OverflowError) as error:
-        reason = getattr(error, "strerror", None) or error
+        reason = str(getattr(error, "strerror", None) or error).split(" (")[0]
         raise InputError(f"cannot serve at {host} port {port}: {reason}; choose another --port, or 0 for any") from None
-    with contextlib.redirect_stdout(io.StringIO()):  # a banner
+    with _quiet():
         return viser.ViserServer(host, port, verbose=False)
+
+
+def _quiet() -> contextlib.redirect_stdout[io.StringIO]:
+    """Without viser's banner and farewell."""
+    return contextlib.redirect_stdout(io.StringIO())
 
 
 def _place_camera(server: "viser.ViserServer", first: Camera, cameras: Sequence[Camera]) -> None:
