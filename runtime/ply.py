@@ -96,13 +96,14 @@ def _encode(gaussians: Gaussians, block: slice, rows: np.ndarray) -> None:
     What has three or four parts goes column by column, since NumPy is slow where its innermost loop is so short.
     """
     sh = gaussians.sh[block]
-    rest = sh.shape[1] - 1
+    coefficients = sh.shape[1]
+    places = np.arange(3 * coefficients).reshape(coefficients, 3)  # of coefficient and channel, in the rows of sh
+    order = np.concatenate([places[0], places[1:].T.ravel()])
+    rows[:, 6:-8] = sh.reshape(len(sh), -1).take(order, axis=1)
     opacities = np.clip(gaussians.opacities[block], MIN_OPACITY, 1 - MIN_OPACITY)
     log_scales = np.log(np.maximum(gaussians.scales[block], MIN_SCALE))
     for axis in range(3):
         rows[:, axis] = gaussians.means[block, axis]
-        rows[:, 6 + axis] = sh[:, 0, axis]
-        rows[:, 9 + axis * rest : 9 + (axis + 1) * rest] = sh[:, 1:, axis]
         rows[:, axis - 7] = log_scales[:, axis]
     rows[:, -8] = np.log(opacities / (1 - opacities))
     for part in range(4):
