@@ -51,7 +51,7 @@ def export(
     except CheckpointError as error:
         raise InputError(str(error)) from None
     fixed = Fixed(views, _fitting_size(size, model.config.size_multiple) if size else None)
-    description = _describe(model, name, checkpoint.name, digest, fixed)
+    description = describe(model, name, checkpoint.name, digest, fixed)
     if not _export(model, description, fixed, out, staged):
         print("error: the graph departs from the network (see the table); nothing was written", file=sys.stderr)
         raise SystemExit(PARITY_BREACH)
@@ -108,7 +108,8 @@ def _load(checkpoint: Path, preset: str | None) -> "tuple[Network, str, str]":
     return model.eval(), name, digest
 
 
-def _describe(model: "Network", preset: str, checkpoint: str, digest: str, fixed: "Fixed") -> Description:
+def describe(model: "Network", preset: str, checkpoint: str, digest: str, fixed: "Fixed") -> Description:
+    """What an exported network says of itself."""
     from ..model.depthsplat import DepthSplatDepth
 
     config = model.config
