@@ -43,7 +43,7 @@ class Place:
         for path in self.folder.glob(f"{self.key}.*{SUFFIX}"):
             with suppress(OSError):
                 if path.name == self._name(path):
-                    os.utime(path)  # used just now
+                    _touch(path)
                     return path
                 path.unlink()
         return None
@@ -106,6 +106,12 @@ def _processor() -> str:
     except OSError:
         return " ".join(platform.uname())
     return "\n".join(sorted({line for line in lines if line.startswith(PROCESSOR_FIELDS)}))
+
+
+def _touch(path: Path) -> None:
+    """Note that a file was used just now, where its folder can be written."""
+    with suppress(OSError):
+        os.utime(path)
 
 
 def _shrink(folder: Path, newest: Path) -> None:

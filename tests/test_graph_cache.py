@@ -138,6 +138,19 @@ def test_without_a_folder_to_write_it_runs_all_the_same(model, tmp_path, below, 
     np.testing.assert_array_equal(run_session(open_session(model), FEEDS)["y"], plain(model))
 
 
+def test_a_cache_that_can_only_be_read_is_used(cache, model, monkeypatch):
+    open_session(model)
+
+    def refuse(*arguments, **options):
+        raise PermissionError(13, "Permission denied")
+
+    for name in ("utime", "unlink", "replace"):
+        monkeypatch.setattr(graph_cache.os, name, refuse)
+    opened = opened_paths(monkeypatch)
+    open_session(model)
+    assert opened == [str(path) for path in entries(cache)]
+
+
 def test_a_write_that_fails_leaves_nothing(cache, model, monkeypatch):
     def full(*arguments):
         raise OSError(28, "No space left on device")
