@@ -20,6 +20,7 @@ import onnxruntime
 
 LAYOUT = 1
 SUFFIX = ".onnx"
+KEY_LENGTH = 32  # hexadecimal digits
 # A larger model runs for so long that a second or two of optimising it do not matter, and would crowd out the others.
 LARGEST_MODEL = 256 << 20  # bytes
 LARGEST_CACHE = 1 << 30  # bytes; what was not used for longest goes first
@@ -89,8 +90,9 @@ def place_for(model: Path) -> Place | None:
     except (OSError, RuntimeError):  # RuntimeError: there is no home folder
         return None
     made_for = [LAYOUT, onnxruntime.__version__, onnxruntime.get_build_info(), _processor()]
-    key = hashlib.sha256(json.dumps(made_for).encode() + content).hexdigest()
-    return Place(folder, key[:32])
+    digest = hashlib.sha256(json.dumps(made_for).encode())
+    digest.update(content)
+    return Place(folder, digest.hexdigest()[:KEY_LENGTH])
 
 
 def _folder() -> Path:
