@@ -17,7 +17,7 @@ from .initialisation import new_model
 from .sparse_products import with_compiled_products
 
 # The running mean forgets at this rate, and faster in the beginning.
-MEAN_DECAY = 0.998
+MEAN_DECAY = 0.99
 MEAN_START = 10
 WEIGHT_DECAY = 0.01
 LARGEST_GRADIENT = 1.0
