@@ -1,7 +1,6 @@
 """The command idesplat-infer: photographs and cameras to a splat file, depth maps and views."""
 
 import json
-import sys
 import time
 from collections import Counter
 from dataclasses import asdict, replace
@@ -27,6 +26,10 @@ if TYPE_CHECKING:
 
 # Frames of the path that --render draws from the first view to the last.
 PATH_FRAMES = 24
+OUT_HELP = (
+    "Splats: .ply, .compressed.ply, .splat, .spz, .sog, .glb. Points: .points.ply, .points.glb, .xyz, .obj. "
+    "Surfaces: .mesh.ply, .mesh.glb, .mesh.obj."
+)
 CLEANING = "Cleaning (off unless asked for)"
 
 
@@ -44,7 +47,7 @@ def infer(
             show_default=False,
         ),
     ],
-    out: Annotated[Path, typer.Option(help="Splat file: .ply, .compressed.ply, .splat or .spz.", show_default=False)],
+    out: Annotated[Path, typer.Option(help=OUT_HELP, show_default=False)],
     model: Annotated[Path, typer.Option(help="A .onnx or staged folder of idesplat-export.", show_default=False)],
     more_images: Annotated[list[Path] | None, typer.Argument(hidden=True)] = None,
     camera_format: Annotated[
@@ -104,6 +107,7 @@ def infer(
     """Turn posed photographs into a 3D Gaussian splat that every viewer opens."""
     from .cameras import write_cameras
     from .cleaning import Cleaning
+    from .formats import is_surface
     from .inputs import Request, read_inputs
     from .runner import Runner
 
@@ -113,14 +117,16 @@ def infer(
     cleaning = Cleaning(min_opacity, trim_border, trim_edges, min_confidence, merge_duplicates)
     given = Request([*images, *(more_images or [])], cameras, camera_format, focal, frames, views, size)
     runner = Runner(model, provider)
+    _check_fit(runner, out, cleaning, {"--render": render, "--report": report})
     inputs = read_inputs(given, runner)
     prepared = inputs.views
     span = runner.depth_range(prepared, near, far)
     prediction = _predict(prepared, runner, span)
     cleaned: dict[str, int] = {}
-    if cleaning.asked:
+    if cleaning.asked and not is_surface(out):
         prediction, cleaned = _clean(prediction, prepared, cleaning)
-    written = _write(prediction, prepared, out, save_depth, render)
+    _write_scene(prediction, prepared, out, cleaning)
+    written = [out, *_write_pictures(prediction, prepared, save_depth, render)]
     if save_cameras is not None:
         write_cameras(save_cameras, inputs.cameras)
         written.append(save_cameras)
@@ -130,7 +136,7 @@ def infer(
     if report is not None:
         from .inference_report import write_report
 
-        write_report(report, prediction.depth, prediction.gaussians, prepared, summary)
+        write_report(report, prediction.depth, prediction.need_gaussians(), prepared, summary)
         written.append(report)
         summary["files"].append(str(report))
     if json_path is not None:
@@ -142,10 +148,7 @@ def infer(
     print(f"near {span.near:.4g} and far {span.far:.4g}, in the cameras' unit: {span.source}")
     for path in written:
         print(f"wrote {path}")
-    known = _cameras_for_drawing(cameras, save_cameras)
-    print(f"open {out} in any splat viewer (SuperSplat, for one), look at it in the browser, or draw it:")
-    print(f"    idesplat-view {out} --cameras {known}")
-    print(f"    idesplat-render {out} --cameras {known} --out DIR")
+    _say_how_to_look(out, _cameras_for_drawing(cameras, save_cameras))
     if report is not None:
         print(f"open {report} in any browser")
     if timings:
@@ -164,6 +167,17 @@ def _cameras_for_drawing(cameras: str, save_cameras: Path | None) -> str:
     return str(save_cameras or "CAMERAS.json (which --save-cameras writes)")
 
 
+def _say_how_to_look(out: Path, cameras: str) -> None:
+    from .formats import holds_splats
+
+    if not holds_splats(out):
+        print(f"open {out} in MeshLab, CloudCompare or Blender")
+        return
+    print(f"open {out} in any splat viewer (SuperSplat, for one), look at it in the browser, or draw it:")
+    print(f"    idesplat-view {out} --cameras {cameras}")
+    print(f"    idesplat-render {out} --cameras {cameras} --out DIR")
+
+
 def _check_outputs(out: Path, files: "Sequence[Path | None]", folders: "Sequence[Path | None]") -> None:
     """Find out before the work whether the results can be written."""
     from .formats import scene_suffix
@@ -177,6 +191,20 @@ def _check_outputs(out: Path, files: "Sequence[Path | None]", folders: "Sequence
     for folder in folders:
         if folder is not None:
             check_writable(make_folder(folder))
+
+
+def _check_fit(runner: "Runner", out: Path, cleaning: "Cleaning", drawn: dict[str, Path | None]) -> None:
+    """Find out before the work whether the model makes what is asked for."""
+    from .formats import MESHES, POINTS, holds_splats, is_surface
+
+    needs = [f"--out {out}"] * holds_splats(out) + [option for option, path in drawn.items() if path is not None]
+    if not is_surface(out):
+        needs += [f"--{step.replace('_', '-')}" for step in cleaning.asked]
+    if needs and not runner.description.gaussians:
+        endings = ", ".join((*POINTS, *MESHES))
+        raise InputError(f"{needs[0]}: {runner.path} predicts depth alone; write points or a surface ({endings})")
+    if is_surface(out) and set(cleaning.asked) - {"trim_edges"}:
+        raise InputError(f"--out {out}: of all cleaning a surface knows --trim-edges alone; leave out the rest")
 
 
 def _check_range(near: float | None, far: float | None) -> None:
@@ -199,21 +227,35 @@ def _clean(prediction: "Prediction", views: "Views", cleaning: "Cleaning") -> "t
     """The prediction without what is to be left out, and how much that was."""
     from .cleaning import clean, describe
 
-    gaussians, taken = clean(prediction.gaussians, prediction.depth, views.extrinsics, views.intrinsics, cleaning)
+    whole = prediction.need_gaussians()
+    gaussians, taken = clean(whole, prediction.depth, views.extrinsics, views.intrinsics, cleaning)
     print(describe(taken, len(gaussians)))
     return replace(prediction, gaussians=gaussians), taken
 
 
-def _write(
-    prediction: "Prediction", views: "Views", out: Path, save_depth: Path | None, render: Path | None
-) -> list[Path]:
-    """Write the splat file and what else was asked for; the paths written."""
-    from .formats import write_scene
+def _write_scene(prediction: "Prediction", views: "Views", out: Path, cleaning: "Cleaning") -> None:
+    """Write the splats, points or surface that the file's name asks for."""
+    from .depth_mesh import LARGEST_JUMP, faces_from_depth
+    from .formats import is_surface, write_scene
+    from .point_cloud import points_from_depth, write_mesh, write_point_cloud
 
+    if not is_surface(out) and prediction.gaussians is not None:
+        for note in write_scene(out, prediction.gaussians):
+            print(f"note: {note}")
+        return
+    points = points_from_depth(prediction.depth, views.images, views.extrinsics, views.intrinsics)
+    if is_surface(out):
+        write_mesh(out, points, faces_from_depth(prediction.depth, cleaning.trim_edges or LARGEST_JUMP))
+    else:
+        write_point_cloud(out, points)
+
+
+def _write_pictures(
+    prediction: "Prediction", views: "Views", save_depth: Path | None, render: Path | None
+) -> list[Path]:
+    """Write depth maps and drawn views, where asked for; the paths written."""
     stems = _stems(views.names)
-    for note in write_scene(out, prediction.gaussians):
-        print(f"note: {note}")
-    written = [out]
+    written = []
     if save_depth is not None:
         written += _write_depth(prediction.depth, stems, save_depth)
     if render is not None:
@@ -247,22 +289,21 @@ def _write_depth(depth: "np.ndarray", stems: list[str], folder: Path) -> list[Pa
 def _write_renders(prediction: "Prediction", views: "Views", stems: list[str], folder: Path) -> list[Path]:
     """The scene from the input views, and along a smooth path from the first to the last."""
     import numpy as np
-    from rich.console import Console
-    from rich.progress import track
 
     from .drawing import draw_view
     from .images_out import save_png
     from .paths import interpolate_extrinsics
+    from .progress import progress
 
+    gaussians = prediction.need_gaussians()
     height, width = prediction.depth.shape[1:]
     K = views.intrinsics.astype(np.float64) * np.array([width, height, 1.0])[:, None]  # [views, 3, 3]
     shots = [(f"view-{stem}.png", pose, k) for stem, pose, k in zip(stems, views.extrinsics, K, strict=True)]
     path = interpolate_extrinsics(views.extrinsics, PATH_FRAMES)
     shots += [(f"path-{index:03d}.png", pose, K.mean(axis=0)) for index, pose in enumerate(path)]
     written = []
-    console = Console(stderr=True)
-    for name, pose, k in track(shots, "drawing views", console=console, disable=not sys.stderr.isatty()):
-        save_png(folder / name, draw_view(prediction.gaussians, pose, k, width, height).rgb)
+    for name, pose, k in progress(shots, "drawing views"):
+        save_png(folder / name, draw_view(gaussians, pose, k, width, height).rgb)
         written.append(folder / name)
     return written
 
@@ -289,7 +330,7 @@ def _summary(
         "near": span.near,
         "far": span.far,
         "near_far_from": span.source,
-        "gaussians": len(prediction.gaussians),
+        "gaussians": 0 if prediction.gaussians is None else len(prediction.gaussians),
         "depth": dict(zip(("smallest", "median", "largest"), np.percentile(depth, (0, 50, 100)).tolist(), strict=True)),
         "seconds": seconds,
         "files": [str(path) for path in written],

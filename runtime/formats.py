@@ -1,4 +1,4 @@
-"""Every file that Gaussians are written to or read from, chosen by the ending of its name.
+"""Every file that a scene is written to or read from, chosen by the ending of its name.
 
 To add a format, write one file with a writer and a reader, and one line here.
 """
@@ -9,10 +9,11 @@ from typing import NamedTuple
 
 from .compressed_ply import read_compressed_ply, write_compressed_ply
 from .errors import InputError
-from .gaussians import Gaussians
+from .gaussians import Gaussians, check_finite
 from .glb import read_glb, write_glb
 from .ply import read_ply, write_ply
 from .ply_header import has_element
+from .point_cloud import points_from_gaussians, write_point_cloud
 from .sog import read_sog, write_sog
 from .splat import read_splat, write_splat
 from .spz import read_spz, write_spz
@@ -48,24 +49,53 @@ FORMATS = {
 }
 
 
+# Endings that stand for points and surfaces, where the last one alone may stand for splats.
+POINTS = (".points.ply", ".points.glb", ".obj", ".xyz")
+MESHES = (".mesh.ply", ".mesh.glb", ".mesh.obj")
+
+
 def write_scene(path: Path, gaussians: Gaussians) -> list[str]:
     """Write Gaussians in the format that the file's name asks for; the file appears whole or not at all.
+
+    As points, they are their centres in the colour that they have from all sides.
 
     Returns a line for each thing that the format cannot hold, such as spherical harmonics.
     Raises InputError for an unknown name, values that no file can hold, or a place that cannot be written.
     """
-    return FORMATS[scene_suffix(path)].write(Path(path), gaussians)
+    suffix = scene_suffix(path)
+    if suffix in MESHES:
+        raise InputError(f"{path}: a surface is made of depth maps, not of Gaussians; write it with idesplat-infer")
+    if suffix in POINTS:
+        check_finite(path, gaussians)
+        write_point_cloud(Path(path), points_from_gaussians(gaussians))
+        return ["points alone, without size, opacity or anything that changes with the direction"]
+    return FORMATS[suffix].write(Path(path), gaussians)
 
 
 def read_scene(path: Path) -> Gaussians:
     """Read Gaussians from a file in any of the formats; raises InputError if that is not possible."""
-    return FORMATS[scene_suffix(path)].read(Path(path))
+    suffix = scene_suffix(path)
+    if suffix not in FORMATS:
+        raise InputError(
+            f"{path}: points and surfaces hold no Gaussians; give a file that ends in {', '.join(FORMATS)}"
+        )
+    return FORMATS[suffix].read(Path(path))
 
 
 def scene_suffix(path: Path) -> str:
     """The longest ending of a file's name that stands for a format; raises InputError if there is none."""
-    name = Path(path).name.lower()
-    endings = [suffix for suffix in FORMATS if name.endswith(suffix)]
+    name, known = Path(path).name.lower(), (*FORMATS, *POINTS, *MESHES)
+    endings = [suffix for suffix in known if name.endswith(suffix)]
     if not endings:
-        raise InputError(f"{path}: expected a splat file, whose name ends in {', '.join(FORMATS)}")
+        raise InputError(f"{path}: expected a file name that ends in {', '.join(known)}")
     return max(endings, key=len)
+
+
+def holds_splats(path: Path) -> bool:
+    """Whether the file's name asks for splats, not points or a surface; raises InputError as `scene_suffix`."""
+    return scene_suffix(path) in FORMATS
+
+
+def is_surface(path: Path) -> bool:
+    """Whether the file's name asks for a surface; raises InputError as `scene_suffix`."""
+    return scene_suffix(path) in MESHES

@@ -16,7 +16,7 @@ from .errors import InputError, refuse
 from .files import read_bytes, replacing
 from .frames import GLTF, half_turned
 from .gaussians import Gaussians, check_finite, check_ranges
-from .quantization import to_bytes
+from .images_out import linear_colours, to_bytes
 from .quaternions import unit_quaternions
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -55,7 +55,7 @@ def write_glb(path: Path, gaussians: Gaussians) -> list[str]:
     turned = half_turned(gaussians, GLTF)
     attributes = {
         "POSITION": turned.means,
-        "COLOR_0": to_bytes(np.column_stack([_linear(turned.colours), turned.opacities]) * 255),
+        "COLOR_0": to_bytes(np.column_stack([linear_colours(turned.colours), turned.opacities])),
         PREFIX + "ROTATION": np.roll(unit_quaternions(turned.quats), -1, axis=1),
         PREFIX + "SCALE": turned.scales,
         PREFIX + "OPACITY": turned.opacities,
@@ -112,12 +112,6 @@ def _read_gaussians(path: Path, document: dict[str, Any], binary: bytes) -> Gaus
 def _coefficients(degree: int) -> list[str]:
     """Attributes of the spherical harmonics up to a degree, in our order."""
     return [f"{PREFIX}SH_DEGREE_{d}_COEF_{index}" for d in range(degree + 1) for index in range(2 * d + 1)]
-
-
-def _linear(colours: np.ndarray) -> np.ndarray:
-    """Colours for COLOR_0, which is linear, where ours are sRGB."""
-    clipped = np.clip(colours, 0, 1)
-    return np.where(clipped <= 0.04045, clipped / 12.92, ((clipped + 0.055) / 1.055) ** 2.4)
 
 
 def _document(attributes: dict[str, np.ndarray]) -> dict[str, Any]:

@@ -60,3 +60,9 @@ def _known(depth: np.ndarray) -> np.ndarray:
 def to_bytes(values: np.ndarray) -> np.ndarray:
     """Numbers in [0, 1] as uint8, rounded."""
     return np.rint(np.clip(values, 0, 1) * 255).astype(np.uint8)
+
+
+def linear_colours(colours: np.ndarray) -> np.ndarray:
+    """Linear light, as glTF has it, for sRGB colours, as pictures have them; both in [0, 1], which is clipped to."""
+    clipped = np.clip(colours, 0, 1)
+    return np.where(clipped <= 0.04045, clipped / 12.92, ((clipped + 0.055) / 1.055) ** 2.4)

@@ -3,7 +3,7 @@
 import numpy as np
 
 
-def to_bytes(values: np.ndarray) -> np.ndarray:
+def nearest_bytes(values: np.ndarray) -> np.ndarray:
     """The nearest whole number from 0 to 255, uint8."""
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 

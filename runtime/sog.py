@@ -24,7 +24,7 @@ from .errors import InputError, refuse
 from .files import check_expansion, read_bytes, replacing
 from .gaussians import Gaussians, check_finite, check_ranges
 from .morton import morton_order
-from .quantization import to_bytes
+from .quantization import nearest_bytes
 from .quaternions import from_smallest_three, smallest_three, unit_quaternions
 
 VERSION = 2
@@ -67,9 +67,11 @@ def write_sog(path: Path, gaussians: Gaussians) -> list[str]:
     log_scales = np.log(np.maximum(gaussians.scales, MIN_SCALE))
     files["scales.webp"], meta["scales"] = _coded(log_scales, "scales.webp")
     largest, others = smallest_three(unit_quaternions(gaussians.quats))
-    files["quats.webp"] = _picture(np.column_stack([to_bytes(others * QUAT_STEPS + 127.5), LARGEST_PART + largest]))
+    files["quats.webp"] = _picture(
+        np.column_stack([nearest_bytes(others * QUAT_STEPS + 127.5), LARGEST_PART + largest])
+    )
     meta["quats"] = {"files": ["quats.webp"]}
-    opacities = to_bytes(gaussians.opacities * 255)
+    opacities = nearest_bytes(gaussians.opacities * 255)
     files["sh0.webp"], meta["sh0"] = _coded(gaussians.sh[:, 0], "sh0.webp", opacities)
     if gaussians.sh_degree:
         pictures, meta["shN"] = _harmonics(gaussians.sh[:, 1:], gaussians.sh_degree)

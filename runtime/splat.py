@@ -12,7 +12,7 @@ import numpy as np
 from .errors import refuse
 from .files import read_bytes, replacing
 from .gaussians import Gaussians, check_finite, check_ranges, with_colours
-from .quantization import moved, to_bytes
+from .quantization import moved, nearest_bytes
 from .quaternions import unit_quaternions
 
 RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
@@ -30,9 +30,9 @@ def write_splat(path: Path, gaussians: Gaussians) -> list[str]:
     records = np.empty(len(gaussians), RECORD)
     records["mean"] = gaussians.means
     records["scale"] = gaussians.scales
-    records["rgba"][:, :3] = to_bytes(gaussians.colours * 255)
-    records["rgba"][:, 3] = to_bytes(gaussians.opacities * 255)
-    records["quat"] = to_bytes(unit_quaternions(gaussians.quats) * ONE + ZERO)
+    records["rgba"][:, :3] = nearest_bytes(gaussians.colours * 255)
+    records["rgba"][:, 3] = nearest_bytes(gaussians.opacities * 255)
+    records["quat"] = nearest_bytes(unit_quaternions(gaussians.quats) * ONE + ZERO)
     with replacing(path) as temporary:
         temporary.write_bytes(records.tobytes())
     lost = [f"spherical harmonics of degree 1 to {gaussians.sh_degree} left out"] if gaussians.sh_degree else []

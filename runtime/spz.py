@@ -21,7 +21,7 @@ from .errors import refuse
 from .files import check_expansion, read_bytes, replacing
 from .frames import OPENGL, half_turned
 from .gaussians import SH_0, Gaussians, check_finite, check_ranges
-from .quantization import moved, to_bytes
+from .quantization import moved, nearest_bytes
 from .quaternions import from_smallest_three, smallest_three, unit_quaternions
 
 HEADER = struct.Struct("<4sIIBBBB")  # magic, version, Gaussians, SH degree, bits behind the point, flags, reserved
@@ -56,11 +56,11 @@ def write_spz(path: Path, gaussians: Gaussians) -> list[str]:
     parts = [
         HEADER.pack(MAGIC, VERSION, len(turned), turned.sh_degree, bits, 0, 0),
         _pack_positions(turned.means, bits),
-        to_bytes(turned.opacities * 255),
-        to_bytes(turned.sh[:, 0] * COLOUR_STEPS + 127.5),
-        to_bytes((log_scales + LOG_SCALE_OFFSET) * LOG_SCALE_STEPS),
+        nearest_bytes(turned.opacities * 255),
+        nearest_bytes(turned.sh[:, 0] * COLOUR_STEPS + 127.5),
+        nearest_bytes((log_scales + LOG_SCALE_OFFSET) * LOG_SCALE_STEPS),
         _pack_rotations(turned.quats),
-        to_bytes(rest * SH_STEPS + SH_STEPS),
+        nearest_bytes(rest * SH_STEPS + SH_STEPS),
     ]
     compressor = zlib.compressobj(wbits=31)  # gzip's header and trailer
     with replacing(path) as temporary, temporary.open("wb") as file:

@@ -14,7 +14,8 @@ import trimesh
 from conftest import run_command
 from idesplat.runtime.convert import main as convert
 from idesplat.runtime.errors import InputError
-from idesplat.runtime.formats import FORMATS, read_scene, scene_suffix, write_scene
+from idesplat.runtime.formats import FORMATS, MESHES, POINTS, read_scene, scene_suffix, write_scene
+from idesplat.runtime.frames import GLTF
 from idesplat.runtime.gaussians import SH_0, Gaussians
 from idesplat.runtime.ply import read_ply, write_ply
 from idesplat.runtime.rasterizer import rasterize
@@ -248,8 +249,29 @@ def test_what_a_format_cannot_hold_is_said(tmp_path: Path, truth: Gaussians) -> 
 def test_the_longest_ending_counts() -> None:
     assert scene_suffix(Path("a/b.COMPRESSED.PLY")) == ".compressed.ply"
     assert scene_suffix(Path("a/b.c.ply")) == ".ply"
-    with pytest.raises(InputError, match=r"scene\.txt: expected a splat file, whose name ends in \.ply, "):
+    with pytest.raises(InputError, match=r"scene\.txt: expected a file name that ends in \.ply, "):
         scene_suffix(Path("scene.txt"))
+
+
+@pytest.mark.parametrize("suffix", POINTS)
+def test_points_of_a_scene(tmp_path: Path, truth: Gaussians, suffix: str) -> None:
+    path = tmp_path / f"scene{suffix}"
+    assert write_scene(path, truth) == [
+        "points alone, without size, opacity or anything that changes with the direction"
+    ]
+    positions = (
+        np.loadtxt(path)[:, :3] if suffix == ".xyz" else trimesh.load(path, force="scene").to_geometry().vertices
+    )
+    signs = GLTF if suffix.endswith(".glb") else (1, 1, 1)
+    np.testing.assert_allclose(positions, truth.means * signs, rtol=1e-6, atol=1e-8)
+    with pytest.raises(InputError, match="points and surfaces hold no Gaussians"):
+        read_scene(path)
+
+
+def test_a_surface_is_not_made_of_gaussians(tmp_path: Path, truth: Gaussians) -> None:
+    for suffix in MESHES:
+        with pytest.raises(InputError, match="write it with idesplat-infer"):
+            write_scene(tmp_path / f"scene{suffix}", truth)
 
 
 def test_a_compressed_ply_under_another_name(tmp_path: Path, truth: Gaussians) -> None:
@@ -278,8 +300,8 @@ def test_the_command_goes_all_the_way_round(
     ("arguments", "message"),
     [
         (("none.ply", "b.spz"), "none.ply"),
-        (("a.ply", "b.txt"), "b.txt: expected a splat file"),
-        (("a.txt", "b.ply"), "a.txt: expected a splat file"),
+        (("a.ply", "b.txt"), "b.txt: expected a file name"),
+        (("a.txt", "b.ply"), "a.txt: expected a file name"),
         (("a.ply", "nowhere/b.spz"), "nowhere"),
         (("a.ply", "a.ply"), "is the file to read"),
         (("a.ply", "folder.spz"), "folder.spz"),

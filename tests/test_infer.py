@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import trimesh
 from conftest import run_command
 from idesplat.runtime.cameras import read_cameras
 from idesplat.runtime.cli import main
@@ -76,6 +77,15 @@ def test_cleaning_is_counted_and_formats_follow_the_name(workplace, capsys):
     left = len(read_scene(Path("scene.spz")))
     assert left == summary["gaussians"] == 2 * 64 * 96 - sum(left_out.values())
     assert f"{left:,} Gaussians left" in capsys.readouterr().out
+
+
+def test_points_and_surfaces_follow_the_name(workplace, capsys):
+    for name, faces in (("scene.points.ply", False), ("scene.mesh.glb", True)):
+        assert run_command(main, *USUAL[:-1], name, *(["--trim-edges", "0.2"] if faces else [])) == 0
+        read = trimesh.load(name, force="scene").to_geometry()
+        assert len(read.vertices) == 2 * 64 * 96
+        assert hasattr(read, "faces") == faces
+        assert f"open {name} in MeshLab" in capsys.readouterr().out
 
 
 def test_portrait_photographs_and_another_size(workplace):
@@ -206,6 +216,11 @@ BAD = {
     "an output folder that is not there": (nothing, ("--out", "nowhere/scene.ply"), "nowhere"),
     "an output folder that nobody may write to": (nothing, ("--out", "/proc/scene.ply"), "cannot write into /proc"),
     "a share that is none": (nothing, ("--min-opacity", "2"), "--min-opacity 2"),
+    "a surface without faint splats": (
+        nothing,
+        ("--out", "scene.mesh.ply", "--min-opacity", "0.1"),
+        "a surface knows --trim-edges alone",
+    ),
     "a border wider than the pictures": (nothing, ("--trim-border", "32"), "--trim-border 32"),
     "an output that is no splat file": (nothing, ("--out", "scene.txt"), ".ply"),
     "an output folder that is a file": (nothing, ("--save-depth", "transforms.json"), "transforms.json"),

@@ -147,7 +147,7 @@ def test_pictures_never_overwrite_photographs(
     ("scene", "cameras", "background", "message"),
     [
         ("none.ply", "cameras.json", (0, 0, 0), "none.ply: No such file"),
-        ("cameras.json", "cameras.json", (0, 0, 0), "cameras.json: expected a splat file"),
+        ("cameras.json", "cameras.json", (0, 0, 0), "cameras.json: expected a file name"),
         ("scene.ply", "none.json", (0, 0, 0), "none.json"),
         ("scene.ply", "scene.ply", (0, 0, 0), "scene.ply: is none of the camera files"),
         ("scene.ply", "cameras.json", (0, 255, 0), "--background is (0.0, 255.0, 0.0)"),
