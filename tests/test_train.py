@@ -96,14 +96,17 @@ def test_entropy_by_hand() -> None:
     assert losses.entropy_loss(probability, candidates, torch.full((1, 1, 1, 1), 2.5)) == 0  # outside of the candidates
 
 
-def test_splats_of_the_wanted_size_cost_nothing() -> None:
+def test_opaque_splats_of_the_wanted_size_cost_nothing() -> None:
     depth = torch.tensor([[[1.0, 2.0], [4.0, 8.0]]])
     intrinsics = torch.tensor([[[0.5, 0, 0.5], [0, 0.5, 0.5], [0, 0, 1]]])
     # With a focal length of half the width of two pixels, a pixel is as large as its depth.
     wanted = losses.SPLAT_PIXELS * depth.reshape(-1, 1).expand(-1, 3)
-    assert float(losses.splat_size_loss(wanted, depth, intrinsics)) == pytest.approx(0, abs=1e-7)
-    found = losses.splat_size_loss(wanted * math.e, depth, intrinsics)
-    assert float(found) == pytest.approx(losses.SPLAT_SHARE, rel=1e-5)
+    opaque, half = torch.ones(4), torch.full((4,), 0.5)
+    assert float(losses.splat_loss(wanted, opaque, depth, intrinsics)) == pytest.approx(0, abs=1e-7)
+    found = losses.splat_loss(wanted * math.e, opaque, depth, intrinsics)
+    assert float(found) == pytest.approx(losses.SIZE_SHARE, rel=1e-5)
+    found = losses.splat_loss(wanted, half, depth, intrinsics)
+    assert float(found) == pytest.approx(losses.OPACITY_SHARE * math.log(2), rel=1e-5)
 
 
 def test_monocular_loss_knows_no_scale() -> None:

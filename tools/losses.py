@@ -24,9 +24,11 @@ MONOCULAR_SHARE = 0.3
 # inverse depth, and in candidates of the coarsest unit.
 LARGE_RELATIVE = 0.5
 LARGE_BINS = 8.0
-# Splats are asked to be about this many pixels large (their standard deviation), which views alone settle slowly.
+# Splats are asked to be about this many pixels large (their standard deviation) and opaque. Views alone settle the size
+# slowly, and answer wrong depth with splats that are half transparent, so that black shows through everywhere.
 SPLAT_PIXELS = 0.6
-SPLAT_SHARE = 0.03
+SIZE_SHARE = 0.03
+OPACITY_SHARE = 0.1
 # The share of LPIPS beside the squared error (the papers' lambda).
 LPIPS_SHARE = 0.05
 # The file that torchvision keeps VGG16's weights in, on which LPIPS rests.
@@ -121,14 +123,16 @@ def photometric_loss(rendered: Tensor, truth: Tensor, perceptual: Perceptual | N
     return loss if perceptual is None else loss + LPIPS_SHARE * perceptual(rendered, truth)
 
 
-def splat_size_loss(scales: Tensor, depth: Tensor, intrinsics: Tensor) -> Tensor:
-    """How far the splats are from the size of the pixels they stand for, in logarithms.
+def splat_loss(scales: Tensor, opacities: Tensor, depth: Tensor, intrinsics: Tensor) -> Tensor:
+    """How far the splats are from the size of the pixels they stand for, and from opaque, in logarithms.
 
-    scales: [views * H * W, 3] scene units. depth: [views, H, W]. intrinsics: normalised, [views, 3, 3].
+    scales: [views * H * W, 3] scene units. opacities: [views * H * W]. depth: [views, H, W]. intrinsics: normalised,
+    [views, 3, 3].
     """
     pixel = depth / (intrinsics[:, 0, 0] * depth.shape[2])[:, None, None]  # scene units
     wanted = (SPLAT_PIXELS * pixel).detach().reshape(-1, 1)
-    return SPLAT_SHARE * (scales.log() - wanted.log()).abs().mean()
+    size = (scales.log() - wanted.log()).abs().mean()
+    return SIZE_SHARE * size - OPACITY_SHARE * opacities.clamp(min=TINY).log().mean()
 
 
 def load_perceptual() -> Perceptual | None:

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from ..model.dpbu import Boosted, Cameras
 from ..model.encoder import Encoded
+from ..model.gaussian_adapter import WorldGaussians
 from ..model.geometry import invert_rigid, scale_intrinsics
 from ..model.idesplat import IDESplat
 from ..model.layers import resize
@@ -19,7 +20,7 @@ from .losses import (
     inverse_depth_loss,
     monocular_loss,
     photometric_loss,
-    splat_size_loss,
+    splat_loss,
     unit_loss,
 )
 from .torch_rasterizer import rasterize
@@ -38,8 +39,8 @@ class Outcome:
     units: tuple[Boosted, ...]
     # The best inverse depth there is, [views, 1, h, w]; h and w are the images' once three units ran.
     inverse_depth: Tensor
-    # The Gaussians' scales and novel views, [targets, 3, H, W], where the phase has them.
-    scales: Tensor | None = None
+    # The Gaussians and novel views, [targets, 3, H, W], where the phase has them.
+    gaussians: WorldGaussians | None = None
     rendered: Tensor | None = None
 
 
@@ -59,7 +60,7 @@ def run_phase(model: IDESplat, views: Views, phase: Phase) -> Outcome:
         return Outcome(encoded, units, fused)
     predicted = model.gaussians(views.images, cameras, encoded, units)
     rendered = render_targets(predicted.gaussians, views)
-    return Outcome(encoded, units, 1 / predicted.depth[:, None], predicted.gaussians.scales, rendered)
+    return Outcome(encoded, units, 1 / predicted.depth[:, None], predicted.gaussians, rendered)
 
 
 def render_targets(gaussians: tuple[Tensor, ...], views: Views) -> Tensor:
@@ -108,8 +109,9 @@ def scene_loss(
             loss = loss + unit_loss(unit, of_layers, views.inverse_depth, bins)
         if phase.units == 3:
             loss = loss + inverse_depth_loss(outcome.inverse_depth, views.inverse_depth[:, None], bins)
-    if outcome.rendered is not None and outcome.scales is not None:
-        loss = loss + splat_size_loss(outcome.scales, 1 / outcome.inverse_depth[:, 0], views.intrinsics)
+    if outcome.rendered is not None and outcome.gaussians is not None:
+        scales, opacities = outcome.gaussians.scales, outcome.gaussians.opacities
+        loss = loss + splat_loss(scales, opacities, 1 / outcome.inverse_depth[:, 0], views.intrinsics)
         loss = loss + PHOTOMETRIC_SHARE * photometric_loss(outcome.rendered, views.target_images, perceptual)
     return loss, {"loss": float(loss.detach()), **entry}
 
