@@ -117,10 +117,11 @@ def choose_pairs(pairs: Sequence[Pair], count: int) -> tuple[list[Pair], str]:
     between = compare([cameras[index] for index in chosen], distances[chosen])
     i, j = np.array(neighbours(np.stack([cameras[index].extrinsics for index in chosen]))).T
     overlap, parallax = between.overlap[i, j], between.parallax[i, j]
+    share = f"{100 * overlap.min():.0f} %" + (" or more" if len(i) > 1 else "")
     angles = " to ".join(dict.fromkeys(f"{angle:.1f}" for angle in (parallax.min(), parallax.max())))
     choice = (
-        f"neighbours share at least {100 * overlap.min():.0f} % of their view, {angles} degrees apart as seen from the "
-        f"scene, which is {np.median(distances[chosen]):.3g} away by {source}"
+        f"neighbours share {share} of their view and stand {angles} degrees apart as seen from the scene, which is "
+        f"{np.median(distances[chosen]):.3g} away by {source}"
     )
     return [pairs[index] for index in chosen], choice
 
