@@ -35,6 +35,16 @@ FRUSTUM_DEPTH = 0.5  # from a camera to its photograph
 NEAR = 1.1 * FRUSTUM_DEPTH
 PHOTOGRAPH_SIDE = 512  # pixels, of the longer side
 LINE = 0.005
+# Chromium runs no module worker from a blob of a page that was opened as a file, and viser 1.1 sorts its splats in one.
+# Where such a worker cannot be made at all, viser's page makes it from a data address instead, and that one runs.
+WORKERS_IN_FILES = """<script>
+window.Worker = class extends Worker {
+  constructor(url, options) {
+    if (String(url).startsWith("blob:null")) throw new Error("no workers from blobs in files");
+    super(url, options);
+  }
+};
+</script>"""
 
 
 class Viewpoint(NamedTuple):
@@ -77,7 +87,8 @@ def standalone_page(gaussians: Gaussians, viewpoints: Sequence[Viewpoint]) -> st
     Raises InputError as `serving` does.
     """
     with serving(gaussians, viewpoints, LOOPBACK, 0) as server:
-        return server.get_scene_serializer().as_html()
+        page = server.get_scene_serializer().as_html()
+    return page.replace("<head>", f"<head>{WORKERS_IN_FILES}", 1)
 
 
 def _start(host: str, port: int) -> "viser.ViserServer":

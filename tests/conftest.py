@@ -1,6 +1,7 @@
 """A network of a tenth of the parameters, exported once, and photographs of a scene, drawn once."""
 
 import os
+import shutil
 import sys
 from pathlib import Path
 
@@ -101,3 +102,21 @@ def scene(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("scene")
     make_scene(folder, seed=2, views=5, height=96, width=128)
     return folder
+
+
+@pytest.fixture(scope="session")
+def browser():
+    """Chromium without a window, which draws by itself what a graphics card would."""
+    path = shutil.which("chromium") or shutil.which("google-chrome")
+    if path is None:
+        pytest.skip("neither chromium nor google-chrome is installed")
+    from playwright.sync_api import sync_playwright
+
+    flags = (
+        "--no-sandbox --disable-quic --no-first-run --disable-background-networking --disable-component-update "
+        "--disable-sync --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader --hide-scrollbars"
+    )
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=flags.split())
+        yield browser
+        browser.close()
