@@ -6,6 +6,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
+import trimesh
 from conftest import run_command
 from idesplat.export import weights
 from idesplat.export.cli import main as export
@@ -13,6 +14,7 @@ from idesplat.export.stages import example_inputs
 from idesplat.model.config import PRESETS
 from idesplat.model.networks import build
 from idesplat.runtime.bundle import INPUTS, read_manifest
+from idesplat.runtime.cli import main as infer
 from idesplat.runtime.runner import Runner
 from reference_weights import draw_tensor
 from test_depthsplat import ONE_SCALE, SMALL
@@ -121,3 +123,27 @@ def test_weights_beside_the_graph_are_found_wherever_both_are_moved(graphs, tmp_
     expected = Runner(graphs["depthsplat-alone"][0]).predict_arrays(*given).depth
     for model in (after / "model.onnx", after / "staged"):
         np.testing.assert_array_equal(Runner(model).predict_arrays(*given).depth, expected)
+
+
+def test_depth_alone_becomes_points_or_a_surface(graphs, scene, tmp_path, capsys):
+    given = (
+        "--images",
+        scene / "images",
+        "--cameras",
+        scene / "transforms.json",
+        "--model",
+        graphs["depthsplat-alone"][0],
+    )
+    for name in ("scene.points.ply", "scene.mesh.glb"):
+        assert run_command(infer, *given, "--out", tmp_path / name, "--save-depth", tmp_path) == 0
+        read = trimesh.load(tmp_path / name, force="scene").to_geometry()
+        depth = np.stack([np.load(path)["depth"] for path in sorted(tmp_path.glob("*.npz"))])
+        assert len(read.vertices) == depth.size == 2 * 64 * 96
+    capsys.readouterr()
+    for asked, option in (
+        (("--out", "scene.ply"), "--out"),
+        (("--out", "a.xyz", "--min-opacity", "0.1"), "--min-opacity"),
+    ):
+        assert run_command(infer, *given, *asked) == 2
+        error = capsys.readouterr().err
+        assert f"{option}" in error and "predicts depth alone; write points or a surface (.points.ply, " in error
