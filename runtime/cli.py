@@ -109,6 +109,7 @@ def infer(
     from .cleaning import Cleaning
     from .formats import is_surface
     from .inputs import Request, read_inputs
+    from .progress import working
     from .runner import Runner
 
     started = time.perf_counter()
@@ -116,7 +117,8 @@ def infer(
     _check_range(near, far)
     cleaning = Cleaning(min_opacity, trim_border, trim_edges, min_confidence, merge_duplicates)
     given = Request([*images, *(more_images or [])], cameras, camera_format, focal, frames, views, size)
-    runner = Runner(model, provider)
+    with working("loading the model"):
+        runner = Runner(model, provider)
     _check_fit(runner, out, cleaning, {"--render": render, "--report": report})
     inputs = read_inputs(given, runner)
     prepared = inputs.views
@@ -217,9 +219,9 @@ def _check_range(near: float | None, far: float | None) -> None:
 
 
 def _predict(views: "Views", runner: "Runner", span: "DepthRange") -> "Prediction":
-    from rich.console import Console
+    from .progress import working
 
-    with Console(stderr=True).status("predicting depth and Gaussians"):
+    with working("predicting depth and Gaussians"):
         return runner.predict_arrays(views.images, views.extrinsics, views.intrinsics, span.near, span.far)
 
 

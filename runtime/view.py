@@ -58,9 +58,11 @@ def view(
             server.sleep_forever()
         return
     from .files import replacing
+    from .progress import working
     from .viewer import standalone_page
 
-    page = standalone_page(gaussians, viewpoints)
+    with working("making the page"):
+        page = standalone_page(gaussians, viewpoints)
     with replacing(html) as temporary:
         temporary.write_text(page, encoding="utf-8")
     print(f"wrote {html}: {len(gaussians):,} Gaussians, {html.stat().st_size / 1e6:.1f} MB; open it in any browser")
