@@ -55,7 +55,14 @@ def test_everything_it_can_write(workplace, scene, capsys):
     assert cv2.imread(str(frames[0])).shape == (64, 96, 3)
     printed = capsys.readouterr().out
     assert f"near {summary['near']:.4g} and far {summary['far']:.4g}" in printed
-    for text in ("wrote scene.ply", "wrote summary.json", "3 of 5 photographs", "idesplat-render scene.ply", "total"):
+    for text in (
+        "wrote scene.ply",
+        "wrote summary.json",
+        "3 of 5 photographs",
+        "idesplat-view scene.ply",
+        "idesplat-render scene.ply",
+        "total",
+    ):
         assert text in printed
 
 
