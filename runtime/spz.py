@@ -1,7 +1,8 @@
 """Gaussians as .spz files (Niantic), some ten times smaller than .ply.
 
-A gzip stream, version 3 written, 2 and 3 read: a header, then all positions, opacities, colours, scales, rotations
-and spherical harmonics. The frame is OpenGL's (x right, y up, z backward), so a scene is turned by half around x.
+Version 3 is written, a gzip stream; 2 to 4 are read. A header, then all positions, opacities, colours, scales,
+rotations and spherical harmonics. The frame is OpenGL's (x right, y up, z backward), so a scene is turned by half
+around x.
 
 positions: 24 bits each, as many of them behind the point as the scene's extent leaves: within 2^-23 of the largest
 coordinate or 2^-25 units, whichever is larger. opacities: 8 bits, within 1/510. colours: 8 bits, within 1/271 from
@@ -10,29 +11,22 @@ smallest three parts of the quaternion, each within 7e-4 (version 2: 8 bits for 
 of degree 1 to 3: 8 bits, within 1/256 from -1 to 0.996.
 """
 
-import struct
 import zlib
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from .errors import refuse
-from .files import check_expansion, read_bytes, replacing
+from .files import read_bytes, replacing
 from .frames import OPENGL, half_turned
 from .gaussians import SH_0, Gaussians, check_finite, check_ranges
 from .quantization import moved, nearest_bytes
 from .quaternions import from_smallest_three, smallest_three, unit_quaternions
+from .spz_container import EXPECTED, HEADER, MAGIC, MOST_FRACTIONAL_BITS, unpack
 
-HEADER = struct.Struct("<4sIIBBBB")  # magic, version, Gaussians, SH degree, bits behind the point, flags, reserved
-MAGIC = b"NGSP"
-GZIP = b"\x1f\x8b"
-VERSION = 3
-HAS_EXTENSIONS = 2  # flag
-EXPECTED = "a splat file (.spz)"
+VERSION = 3  # to write: version 4 is not read everywhere yet
 
 POSITION_LIMIT = (1 << 23) - 1  # of 24 bits with a sign
-MOST_FRACTIONAL_BITS = 24
 LOG_SCALE_STEPS, LOG_SCALE_OFFSET = 16, 10  # byte = (log scale + 10) * 16
 COLOUR_STEPS = 0.15 * 255  # byte = sh * steps + 127.5: the range is wider than that of colours
 SH_STEPS = 128  # byte = sh * 128 + 128
@@ -75,17 +69,17 @@ def write_spz(path: Path, gaussians: Gaussians) -> list[str]:
 
 def read_spz(path: Path) -> Gaussians:
     """Read a .spz; raises InputError if the file cannot be read, is not one we know, or is damaged."""
-    header, body = _inflate(path, read_bytes(path, EXPECTED))
+    header, body = unpack(path, read_bytes(path, EXPECTED))
     count, coefficients = header.gaussians, (header.sh_degree + 1) ** 2
     fields, start = [], 0
-    for size in _sizes(header):
+    for size in header.sizes:
         fields.append(np.frombuffer(body, np.uint8, count * size, start).reshape(count, size))
         start += count * size
     positions, opacities, colours, scales, rotations, rest = fields
     sh = np.empty((count, coefficients, 3), np.float32)
     sh[:, 0] = (colours - np.float32(127.5)) / COLOUR_STEPS
     sh[:, 1:] = (rest.reshape(count, coefficients - 1, 3) - np.float32(SH_STEPS)) / SH_STEPS
-    unpack_rotations = _unpack_rotations if header.version == VERSION else _unpack_version_2_rotations
+    unpack_rotations = _unpack_version_2_rotations if header.version == 2 else _unpack_rotations
     gaussians = Gaussians(
         means=_unpack_positions(positions, header.fractional_bits),
         scales=np.exp(scales / np.float32(LOG_SCALE_STEPS) - LOG_SCALE_OFFSET),
@@ -94,57 +88,6 @@ def read_spz(path: Path) -> Gaussians:
         sh=sh,
     )
     return half_turned(gaussians, OPENGL)
-
-
-class _Header(NamedTuple):
-    """What precedes the numbers."""
-
-    version: int
-    gaussians: int
-    sh_degree: int
-    fractional_bits: int
-
-
-def _sizes(header: _Header) -> tuple[int, ...]:
-    """Bytes a Gaussian of positions, opacities, colours, scales, rotations and spherical harmonics."""
-    return 9, 1, 3, 3, 4 if header.version == VERSION else 3, 3 * ((header.sh_degree + 1) ** 2 - 1)
-
-
-def _inflate(path: Path, content: bytes) -> tuple[_Header, bytes]:
-    """Header and numbers out of the gzip stream; never more of it than the header announces."""
-    if content.startswith(MAGIC):
-        refuse(path, ".spz of version 4", "expected version 2 or 3; convert it, for example with splat-transform")
-    if not content.startswith(GZIP):
-        refuse(path, "not a .spz file (it is no gzip stream)", f"expected {EXPECTED}")
-    inflater = zlib.decompressobj(wbits=31)
-    try:
-        header = _read_header(path, inflater.decompress(content, HEADER.size))
-        size = header.gaussians * sum(_sizes(header))
-        check_expansion(path, size, len(content))
-        body = inflater.decompress(inflater.unconsumed_tail, size) if size else b""
-        beyond = inflater.decompress(inflater.unconsumed_tail, 1)  # at the end, zlib compares the checksum
-    except zlib.error:
-        refuse(path, "the gzip stream is damaged", "copy or download it again")
-    if len(body) < size or not (inflater.eof or beyond):
-        refuse(path, f"cut short: {header.gaussians} Gaussians need {size} bytes", "copy or download it again")
-    return header, body
-
-
-def _read_header(path: Path, content: bytes) -> _Header:
-    if len(content) < HEADER.size:
-        refuse(path, "cut short in its header", "copy or download it again")
-    magic, version, count, sh_degree, fractional_bits, flags, _ = HEADER.unpack(content)
-    if magic != MAGIC:
-        refuse(path, "not a .spz file (a gzip stream of something else)", f"expected {EXPECTED}")
-    if version not in (2, VERSION):
-        refuse(path, f".spz of version {version}", "expected version 2 or 3; write it as one of those")
-    if sh_degree > 3:
-        refuse(path, f"SH degree {sh_degree}", "expected 0 to 3; write it with one of those")
-    if fractional_bits > MOST_FRACTIONAL_BITS:
-        refuse(path, f"{fractional_bits} bits behind the point", f"expected at most {MOST_FRACTIONAL_BITS}")
-    if flags & HAS_EXTENSIONS:
-        refuse(path, "has extensions, which may change its axes", "write it without them")
-    return _Header(version, count, sh_degree, fractional_bits)
 
 
 def _fractional_bits(path: Path, means: np.ndarray) -> int:

@@ -1,6 +1,7 @@
 """Splat files that are cut, mixed up, bombs, or not what their name says: one line each, and no harm done."""
 
 import json
+import sys
 import tracemalloc
 import warnings
 import zipfile
@@ -12,6 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import zstandard
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from idesplat.runtime.errors import InputError
@@ -19,6 +21,7 @@ from idesplat.runtime.formats import FORMATS, read_scene, write_scene
 from idesplat.runtime.gaussians import Gaussians
 from splat_cases import (
     ARRAYS,
+    DATA,
     glb,
     gzipped,
     load_truth,
@@ -31,6 +34,9 @@ def truth() -> Gaussians:
     return load_truth()
 
 
+VERSION_4 = "scene.v4.spz"  # which others write, and we read
+
+
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory, truth: Gaussians) -> dict[str, bytes]:
     """A small file of every format."""
@@ -38,7 +44,8 @@ def written(tmp_path_factory: pytest.TempPathFactory, truth: Gaussians) -> dict[
     small = Gaussians(*(getattr(truth, name)[:5] for name in ARRAYS))
     for suffix in FORMATS:
         write_scene(folder / f"scene{suffix}", small)
-    return {suffix: (folder / f"scene{suffix}").read_bytes() for suffix in FORMATS}
+    files = {suffix: (folder / f"scene{suffix}").read_bytes() for suffix in FORMATS}
+    return files | {VERSION_4: (DATA / VERSION_4).read_bytes()}
 
 
 def read_or_refuse(path: Path) -> Gaussians | None:
@@ -58,7 +65,7 @@ def read_or_refuse(path: Path) -> Gaussians | None:
     return gaussians
 
 
-@pytest.mark.parametrize("suffix", FORMATS)
+@pytest.mark.parametrize("suffix", [*FORMATS, VERSION_4])
 def test_truncations_are_refused(tmp_path: Path, written: dict[str, bytes], suffix: str) -> None:
     path = tmp_path / f"cut{suffix}"
     content = written[suffix]
@@ -92,8 +99,11 @@ def test_values_that_are_not_numbers_are_not_written(tmp_path: Path, truth: Gaus
 
 
 BROKEN_SPZ = {
-    "version 4": (b"NGSP" + b"\x04" + b"\x00" * 40, "version 4"),
-    "version 1": (gzipped(spz_header(version=1)), "version 1; expected version 2 or 3"),
+    "version 1": (gzipped(spz_header(version=1)), "version 1; expected version 2 to 4"),
+    "version 5": (spz_header(version=5), "version 5; expected version 2 to 4"),
+    "version 4 in gzip": (gzipped(spz_header(version=4)), "version 4; expected"),
+    "version 4, cut": (spz_header(version=4, count=1), "0 streams with their contents at byte 0; expected 5"),
+    "version 4, far too many": (spz_header(version=4, count=1 << 31), "claim to hold 42949672960 are no scene"),
     "other magic": (gzipped(spz_header(magic=b"GSPN")), "gzip stream of something else"),
     "short header": (gzipped(spz_header()[:10]), "cut short in its header"),
     "degree 4": (gzipped(spz_header(degree=4)), "SH degree 4; expected 0 to 3"),
@@ -112,6 +122,39 @@ def test_broken_spz_files_are_named(tmp_path: Path, name: str) -> None:
     path.write_bytes(content)
     with pytest.raises(InputError, match=message):
         read_scene(path)
+
+
+def zstd_spz(count: int, unpacked: int) -> bytes:
+    """A .spz of version 4 whose five streams hold zeros, as many as are said, whatever the table of contents says."""
+    header = spz_header(count, version=4)[:-1] + bytes([5])
+    stream = zstandard.ZstdCompressor().compress(bytes(unpacked))
+    table = b"".join(np.array([len(stream), count * size], "<u8").tobytes() for size in (9, 1, 3, 3, 4))
+    return header + np.array([32, 0, 0, 0], "<u4").tobytes() + table + 5 * stream
+
+
+def test_a_zstd_bomb_does_not_go_off(tmp_path: Path) -> None:
+    """Streams that hold far more than they say are read as far as they say."""
+    path = tmp_path / "bomb.spz"
+    path.write_bytes(zstd_spz(3, 300_000_000))
+    tracemalloc.start()
+    assert len(read_scene(path)) == 3
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 20_000_000
+    path.write_bytes(zstd_spz(3, 26))
+    with pytest.raises(InputError, match="cut short: stream 0 needs 27 bytes"):
+        read_scene(path)
+    damaged = bytearray(zstd_spz(3, 27))
+    damaged[32 + 5 * 16 : 32 + 5 * 16 + 4] = b"none"
+    path.write_bytes(damaged)
+    with pytest.raises(InputError, match="stream 0 is damaged"):
+        read_scene(path)
+
+
+def test_without_zstandard_the_remedy_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "zstandard", None)
+    with pytest.raises(InputError, match=r'v4.spz: .spz of version 4 .*; pip install "idesplat\[spz\]"'):
+        read_scene(DATA / VERSION_4)
 
 
 def test_a_bomb_does_not_go_off(tmp_path: Path) -> None:
@@ -249,7 +292,7 @@ SNIPPETS = [b"9", b"-", b"null", b"[", b"{}", b"1e999", b"NaN", b'"x"', b"\xff\x
 
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@pytest.mark.parametrize("suffix", FORMATS)
+@pytest.mark.parametrize("suffix", [*FORMATS, VERSION_4])
 @given(data=st.data())
 def test_any_mutation_gives_a_scene_or_an_input_error(
     tmp_path: Path, written: dict[str, bytes], suffix: str, data: st.DataObject

@@ -110,6 +110,7 @@ FOREIGN = {
     "scene.gsplat.compressed.ply": ".compressed.ply",
     "scene.splat": ".splat",
     "scene.v3.spz": ".spz",
+    "scene.v4.spz": ".spz",
     "scene.glb": ".glb",
     "scene.sog": ".sog",
 }
