@@ -6,6 +6,8 @@ from pathlib import Path, PurePosixPath
 
 from .images import SUFFIXES, find_images, load_image, stem
 
+GIVE_PICTURES = "give the pictures with --images, which idesplat-cameras convert takes, too"
+
 
 def picture_size(name: str, folder: Path, pictures: Sequence[Path]) -> tuple[int, int] | None:
     """Width and height of the picture that a camera names, or None where there is no such picture.

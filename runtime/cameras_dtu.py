@@ -47,7 +47,7 @@ def files_in(folder: Path) -> list[Path]:
 
 
 def _camera(file: Path, candidates: Sequence[Path]) -> Camera:
-    from .camera_pictures import size_of
+    from .camera_pictures import GIVE_PICTURES, size_of
 
     pose, K, depth_range = _parse(read_text(file))
     name = file.name
@@ -55,7 +55,7 @@ def _camera(file: Path, candidates: Sequence[Path]) -> Camera:
         name = name.removesuffix(ending)
     picture = _picture(name, candidates)
     if picture is None:
-        raise InputError(f"gives no size in pixels, and there is no picture {name}.*; give the pictures with --images")
+        raise InputError(f"gives no size in pixels, and there is no picture {name}.*; {GIVE_PICTURES}")
     width, height = size_of(picture)
     if _is_quarter(K, width, height):
         K = np.diag([QUARTER, QUARTER, 1]) @ K

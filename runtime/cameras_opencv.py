@@ -129,8 +129,8 @@ def _size(fields: dict[str, Any], pictures: Sequence[Path]) -> tuple[int, int]:
         if not (width.is_integer() and height.is_integer()):
             raise InputError(f"the image's size is {width:g} x {height:g}, expected whole pixels")
         return int(width), int(height)
-    if not pictures:
-        raise InputError(f"gives no {SIZE[0]}, and no picture to take it from; give the two pictures with --images")
-    from .camera_pictures import size_of
+    from .camera_pictures import GIVE_PICTURES, size_of
 
+    if not pictures:
+        raise InputError(f"gives no {SIZE[0]}, and there is no picture to take it from; {GIVE_PICTURES}")
     return size_of(pictures[0])

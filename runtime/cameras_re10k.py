@@ -55,7 +55,7 @@ def _rows(path: Path) -> list[tuple[int, str, np.ndarray]]:
 
 def _size(names: Sequence[str], folder: Path, pictures: Sequence[Path]) -> tuple[int, int]:
     """The size of the first frame that has a picture: all are cut from one video."""
-    from .camera_pictures import picture_size
+    from .camera_pictures import GIVE_PICTURES, picture_size
 
     for name in names:
         size = picture_size(name, folder, pictures)
@@ -63,5 +63,5 @@ def _size(names: Sequence[str], folder: Path, pictures: Sequence[Path]) -> tuple
             return size
     raise InputError(
         f"gives no size in pixels, and no picture is named by one of its {len(names)} timestamps, such as {names[0]}; "
-        "give the frames with --images"
+        + GIVE_PICTURES
     )

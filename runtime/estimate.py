@@ -18,7 +18,7 @@ from .errors import InputError
 from .focal_length import exif_focal, given_focal
 from .images import load_image
 from .matching import Features, find_features, match_features, rays_of
-from .progress import progress
+from .progress import progress, working
 from .sparse_depth import range_of_depths
 from .two_view import TwoViews, estimate_pose, explained_by_turning
 
@@ -60,7 +60,8 @@ def estimate_cameras(pictures: Sequence[Path], focal: str | None = None) -> list
         check_mapper(len(pictures))
         photographs = [_see(picture, focal) for picture in progress(pictures, "finding features")]
         return _in_unit(*place_photographs(photographs, refine_focal=focal is None))
-    return _in_unit(*_two_cameras(_see(pictures[0], focal), _see(pictures[1], focal)))
+    with working("finding the cameras"):
+        return _in_unit(*_two_cameras(_see(pictures[0], focal), _see(pictures[1], focal)))
 
 
 def _see(picture: Path, focal: str | None) -> Photograph:

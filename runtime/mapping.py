@@ -13,7 +13,7 @@ from .cameras import Camera
 from .cameras_colmap import INSTALL, describe, observed_depths, to_camera
 from .errors import InputError
 from .matching import match_features
-from .progress import progress
+from .progress import progress, working
 
 if TYPE_CHECKING:
     import pycolmap
@@ -49,9 +49,9 @@ def place_photographs(photographs: "Sequence[Photograph]", refine_focal: bool) -
     with tempfile.TemporaryDirectory() as folder:
         database_path = Path(folder) / "database.db"
         _fill(database_path, photographs)
-        pycolmap.geometric_verification(database_path)
-        options = _options(refine_focal)
-        models = pycolmap.incremental_mapping(database_path, folder, folder, options)
+        with working("placing photographs"):
+            pycolmap.geometric_verification(database_path)
+            models = pycolmap.incremental_mapping(database_path, folder, folder, _options(refine_focal))
     if not models:
         raise InputError(
             f"--cameras estimate: the {len(photographs)} photographs do not fit together; give more of them, that "

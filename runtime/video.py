@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from .errors import InputError
+from .progress import working
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 FRAMES = 20
@@ -29,7 +30,8 @@ def sample_frames(video: Path, folder: Path) -> list[Path]:
 
     Raises InputError if the video cannot be read or has fewer than two frames.
     """
-    sharpness = dict(_sharpness(video))
+    with working("looking for sharp frames"):
+        sharpness = dict(_sharpness(video))
     if len(sharpness) < 2:
         raise InputError(f"{video}: has {len(sharpness)} frames that can be read, expected two at least")
     parts = np.array_split(list(sharpness), min(FRAMES, len(sharpness)))

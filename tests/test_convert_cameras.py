@@ -40,7 +40,7 @@ def test_pictures_give_the_size(folder, capsys):
     cameras = known(["100", "200"])
     Path("trajectory.txt").write_text(as_re10k(cameras))
     assert run_command(main, "convert", "trajectory.txt", "cameras.json") == 2
-    assert "give the frames with --images" in capsys.readouterr().err and not Path("cameras.json").exists()
+    assert "give the pictures with --images" in capsys.readouterr().err and not Path("cameras.json").exists()
     save_pictures(folder / "frames", ["100.png"])
     assert run_command(main, "convert", "trajectory.txt", "cameras.json", "--images", "frames") == 0
     assert_same(read_cameras(Path("cameras.json")), cameras)
