@@ -30,9 +30,9 @@ LOOPBACK = "127.0.0.1"
 DISTANCE = 10.0
 LARGEST_SCALE = 200.0  # whose square half precision still holds
 SIZE = (720, 1280)  # of the view of a scene without cameras: height and width
-FRUSTUM_DEPTH = 0.5  # from a camera to its photograph
-# Within this nothing is shown, so that a camera's own photograph does not stand before what it saw.
-NEAR = 1.1 * FRUSTUM_DEPTH
+FRUSTUM_DEPTH = 0.4  # from a camera to its photograph
+# Within this nothing is shown, so that the first camera's photograph and its neighbours' do not hide what it saw.
+NEAR = 1.0
 PHOTOGRAPH_SIDE = 512  # pixels, of the longer side
 LINE = 0.005
 # Chromium runs no module worker from a blob of a page that was opened as a file, and viser 1.1 sorts its splats in one.
