@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 # Frames of the path that --render draws from the first view to the last.
 PATH_FRAMES = 24
+# What the folder's name ends in where a model that predicts depth alone is not told where to.
+DEPTH_FOLDER = "-depth"
 OUT_HELP = (
     "Splats: .ply, .compressed.ply, .splat, .spz, .sog, .glb. Points: .points.ply, .points.glb, .xyz, .obj. "
     "Surfaces: .mesh.ply, .mesh.glb, .mesh.obj."
@@ -107,7 +109,7 @@ def infer(
     """Turn posed photographs into a 3D Gaussian splat that every viewer opens."""
     from .cameras import write_cameras
     from .cleaning import Cleaning
-    from .formats import is_surface
+    from .formats import holds_splats, is_surface
     from .inputs import Request, read_inputs
     from .progress import working
     from .runner import Runner
@@ -128,6 +130,8 @@ def infer(
     if cleaning.asked and not is_surface(out):
         prediction, cleaned = _clean(prediction, prepared, cleaning)
     _write_scene(prediction, prepared, out, cleaning)
+    if prediction.gaussians is None and save_depth is None:  # depth maps are what such a model is for
+        save_depth = make_folder(out.with_name(out.name.partition(".")[0] + DEPTH_FOLDER))
     written = [out, *_write_pictures(prediction, prepared, save_depth, render)]
     if save_cameras is not None:
         write_cameras(save_cameras, inputs.cameras)
@@ -150,7 +154,10 @@ def infer(
     print(f"near {span.near:.4g} and far {span.far:.4g}, in the cameras' unit: {span.source}")
     for path in written:
         print(f"wrote {path}")
-    _say_how_to_look(out, _cameras_for_drawing(cameras, save_cameras))
+    if prediction.gaussians is not None and holds_splats(out):
+        _say_how_to_draw(out, _cameras_for_drawing(cameras, save_cameras))
+    else:
+        print(f"open {out} in MeshLab, CloudCompare or Blender")
     if report is not None:
         print(f"open {report} in any browser")
     if timings:
@@ -169,12 +176,7 @@ def _cameras_for_drawing(cameras: str, save_cameras: Path | None) -> str:
     return str(save_cameras or "CAMERAS.json (which --save-cameras writes)")
 
 
-def _say_how_to_look(out: Path, cameras: str) -> None:
-    from .formats import holds_splats
-
-    if not holds_splats(out):
-        print(f"open {out} in MeshLab, CloudCompare or Blender")
-        return
+def _say_how_to_draw(out: Path, cameras: str) -> None:
     print(f"open {out} in any splat viewer (SuperSplat, for one), look at it in the browser, or draw it:")
     print(f"    idesplat-view {out} --cameras {cameras}")
     print(f"    idesplat-render {out} --cameras {cameras} --out DIR")
@@ -196,14 +198,19 @@ def _check_outputs(out: Path, files: "Sequence[Path | None]", folders: "Sequence
 
 
 def _check_fit(runner: "Runner", out: Path, cleaning: "Cleaning", drawn: dict[str, Path | None]) -> None:
-    """Find out before the work whether the model makes what is asked for."""
-    from .formats import MESHES, POINTS, holds_splats, is_surface
+    """Find out before the work whether the model makes what is asked for.
 
-    needs = [f"--out {out}"] * holds_splats(out) + [option for option, path in drawn.items() if path is not None]
+    Of a model that predicts depth alone, a name that may stand for splats or points stands for points.
+    """
+    from .formats import MESHES, holds_splats, is_surface, scene_suffix
+    from .point_cloud import POINT_SUFFIXES
+
+    splats = holds_splats(out) and scene_suffix(out) not in POINT_SUFFIXES
+    needs = [f"--out {out}"] * splats + [option for option, path in drawn.items() if path is not None]
     if not is_surface(out):
         needs += [f"--{step.replace('_', '-')}" for step in cleaning.asked]
     if needs and not runner.description.gaussians:
-        endings = ", ".join((*POINTS, *MESHES))
+        endings = ", ".join((*POINT_SUFFIXES, *MESHES))
         raise InputError(f"{needs[0]}: {runner.path} predicts depth alone; write points or a surface ({endings})")
     if is_surface(out) and set(cleaning.asked) - {"trim_edges"}:
         raise InputError(f"--out {out}: of all cleaning a surface knows --trim-edges alone; leave out the rest")

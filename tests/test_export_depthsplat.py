@@ -1,6 +1,8 @@
-"""DepthSplat exported: one scale, two, and depth alone, held in ONNX Runtime against PyTorch."""
+"""DepthSplat exported: one scale, two, and depth alone, held in ONNX Runtime against PyTorch, and in use."""
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import onnx
@@ -125,25 +127,52 @@ def test_weights_beside_the_graph_are_found_wherever_both_are_moved(graphs, tmp_
         np.testing.assert_array_equal(Runner(model).predict_arrays(*given).depth, expected)
 
 
-def test_depth_alone_becomes_points_or_a_surface(graphs, scene, tmp_path, capsys):
-    given = (
-        "--images",
-        scene / "images",
-        "--cameras",
-        scene / "transforms.json",
-        "--model",
-        graphs["depthsplat-alone"][0],
-    )
-    for name in ("scene.points.ply", "scene.mesh.glb"):
-        assert run_command(infer, *given, "--out", tmp_path / name, "--save-depth", tmp_path) == 0
-        read = trimesh.load(tmp_path / name, force="scene").to_geometry()
-        depth = np.stack([np.load(path)["depth"] for path in sorted(tmp_path.glob("*.npz"))])
-        assert len(read.vertices) == depth.size == 2 * 64 * 96
-    capsys.readouterr()
-    for asked, option in (
-        (("--out", "scene.ply"), "--out"),
-        (("--out", "a.xyz", "--min-opacity", "0.1"), "--min-opacity"),
-    ):
-        assert run_command(infer, *given, *asked) == 2
-        error = capsys.readouterr().err
-        assert f"{option}" in error and "predicts depth alone; write points or a surface (.points.ply, " in error
+# ---- a model that predicts depth alone, in use
+
+
+@pytest.fixture
+def given(graphs, scene, tmp_path, monkeypatch):
+    """Arguments of idesplat-infer, from a folder of one's own."""
+    monkeypatch.chdir(tmp_path)
+    model = graphs["depthsplat-alone"][0]
+    return ["--images", scene / "images", "--cameras", scene / "transforms.json", "--model", model]
+
+
+@pytest.mark.parametrize("name", ("scene.ply", "scene.glb", "scene.points.ply", "scene.mesh.glb"))
+def test_depth_alone_becomes_depth_maps_and_points_or_a_surface(given, name, capsys):
+    assert run_command(infer, *given, "--out", name) == 0
+    maps = sorted(Path("scene-depth").glob("*.npz"))
+    assert len(maps) == len(list(Path("scene-depth").glob("*.png"))) == 2
+    depth = np.stack([np.load(path)["depth"] for path in maps])
+    geometry = trimesh.load(name, force="scene").to_geometry()
+    assert len(geometry.vertices) == depth.size == 2 * 64 * 96
+    colours = geometry.colors if "mesh" not in name else geometry.visual.vertex_colors
+    assert colours[:, :3].std() > 1
+    printed = capsys.readouterr().out
+    assert f"wrote {name}" in printed and f"wrote {maps[0]}" in printed
+    assert f"open {name} in MeshLab" in printed and "idesplat-render" not in printed
+
+
+def test_depth_maps_go_where_they_are_wanted(given):
+    assert run_command(infer, *given, "--out", "scene.ply", "--save-depth", "maps", "--json", "scene.json") == 0
+    assert len(list(Path("maps").iterdir())) == 4
+    assert sorted(path.name for path in Path().iterdir()) == ["maps", "scene.json", "scene.ply"]
+    assert json.loads(Path("scene.json").read_text())["gaussians"] == 0
+
+
+@pytest.mark.parametrize(
+    "asked",
+    (
+        ("--out", "scene.spz"),
+        ("--out", "scene.ply", "--render", "drawn"),
+        ("--out", "scene.ply", "--report", "report.html"),
+        ("--out", "scene.ply", "--min-opacity", "0.1"),
+    ),
+    ids=lambda asked: asked[-2],
+)
+def test_what_needs_gaussians_is_refused_in_one_line(given, asked, capsys):
+    assert run_command(infer, *given, *asked) == 2
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert asked[-2] in message and "predicts depth alone; write points or a surface (.ply, " in message
+    assert not Path("scene.ply").exists()
