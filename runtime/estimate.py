@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from .camera_fields import calibration
-from .cameras import Camera, invert_rigid
+from .cameras import Camera, check_intrinsics, invert_rigid, located
 from .errors import InputError
 from .focal_length import exif_focal, given_focal
 from .images import load_image
@@ -68,7 +68,8 @@ def _see(picture: Path, focal: str | None) -> Photograph:
     image = load_image(picture)
     height, width = image.shape[:2]
     scale = min(1.0, LONGEST_SIDE / max(height, width))
-    small = cv2.resize(image, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA)
+    small_size = max(1, round(width * scale)), max(1, round(height * scale))
+    small = cv2.resize(image, small_size, interpolation=cv2.INTER_AREA)
     features = find_features(small)
     places = features.places * (width / small.shape[1], height / small.shape[0])
     known = exif_focal(picture, width, height) if focal is None else given_focal(focal, width, height)
@@ -77,7 +78,7 @@ def _see(picture: Path, focal: str | None) -> Photograph:
 
 def _two_cameras(first: Photograph, second: Photograph) -> tuple[list[Camera], np.ndarray]:
     """The cameras of two photographs, and the depths of what both see."""
-    Ks = [pinhole(photograph) for photograph in (first, second)]
+    Ks = [_pinhole(photograph) for photograph in (first, second)]
     pair = f"{first.path} and {second.path}"
     matches = match_features(first.features, second.features)
     if len(matches) < FEWEST_MATCHES:
@@ -100,14 +101,17 @@ def _two_cameras(first: Photograph, second: Photograph) -> tuple[list[Camera], n
     return cameras, np.concatenate(depths)
 
 
-def pinhole(photograph: Photograph) -> np.ndarray:
-    """K [3, 3] with the axis in the middle; raises InputError where the focal length is not known."""
+def _pinhole(photograph: Photograph) -> np.ndarray:
+    """K [3, 3] with the axis in the middle; raises InputError where the focal length is not known, or absurd."""
     if photograph.focal is None:
         raise InputError(
             f"{photograph.path}: its EXIF data tells no focal length; give --focal, in pixels or as on 35 mm film "
             "(a phone's main camera is about 26mm)"
         )
-    return calibration(photograph.focal, photograph.focal, photograph.width / 2, photograph.height / 2)
+    K = calibration(photograph.focal, photograph.focal, photograph.width / 2, photograph.height / 2)
+    with located(str(photograph.path)):
+        check_intrinsics(K, photograph.width, photograph.height)
+    return K
 
 
 def _checked(found: TwoViews | None, pair: str, matches: int) -> TwoViews:

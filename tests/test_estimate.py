@@ -112,6 +112,7 @@ def test_refusals(room, tmp_path, monkeypatch):
         ([first], focal, "1 photograph given, expected two at least"),
         ([first, second], None, "tells no focal length; give --focal"),
         ([first, second], "wide", "--focal wide: expected pixels"),
+        ([first, second], "999999", r"000\.png: the focal lengths .* not plausible"),
         ([first, first], focal, r"too nearly the same place: .*expected 1\.5 at least; step aside"),
         ([first, rotated], focal, "too nearly the same place"),
         ([first, blank], focal, "0 points found in both, expected 40 at least"),
