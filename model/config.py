@@ -98,6 +98,9 @@ class EncoderConfig:
     sh_degree: int = 2
     scale_min: float = 1e-10
     scale_max: float = 3.0
+    # Whether Gaussians' scales are predicted in pixels at their depth, and not in scene units as in the releases: the
+    # network is not told the focal length, so that in scene units it serves one field of view and one image size.
+    scale_in_pixels: bool = False
     # The depth range it was trained with, in scene units.
     near: float = 0.5
     far: float = 100.0
@@ -206,6 +209,7 @@ PRESETS: dict[str, IDESplatConfig | DepthSplatConfig] = {
         focus=FocusConfig(channels=48, window=8, topk=(64, 64, 32, 32)),
         # Procedural surfaces hardly shine: bands above the first would learn little, and double the .ply file.
         sh_degree=1,
+        scale_in_pixels=True,
         # Its scenes have the unit in which near is 1, and far lies between 2 and 200.
         near=1.0,
         trained_views=(2, 3),

@@ -7,6 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from .config import EncoderConfig
 from .geometry import Cameras, invert_intrinsics, pixel_grid
 
 # The releases shift the raw scale before softplus, so that splats start at about pixel size.
@@ -34,10 +35,10 @@ class GaussianAdapter(nn.Module):
 
     sh_decay: Tensor
 
-    def __init__(self, sh_degree: int, scale_min: float, scale_max: float) -> None:
+    def __init__(self, config: EncoderConfig) -> None:
         super().__init__()
-        self.scale_min, self.scale_max = scale_min, scale_max
-        self.coefficients = (sh_degree + 1) ** 2
+        self.scale_min, self.scale_max, self.in_pixels = config.scale_min, config.scale_max, config.scale_in_pixels
+        self.coefficients, sh_degree = config.sh_coefficients, config.sh_degree
         decay = [
             SH_SHARE * SH_DECAY**band if band else 1.0 for band in range(sh_degree + 1) for _ in range(2 * band + 1)
         ]
@@ -49,6 +50,8 @@ class GaussianAdapter(nn.Module):
         logits, offsets, scales, rotations, sh = raw.flatten(2).transpose(1, 2).split(sizes, dim=-1)
         means = self._means(offsets.sigmoid(), depth, cameras)
         scales = F.softplus(scales - SCALE_SHIFT).clamp(self.scale_min, self.scale_max)
+        if self.in_pixels:
+            scales = scales * self._pixel_sizes(depth, cameras)
         camera = cameras.extrinsics[:, :3, :3]
         quats = quaternion_product(quaternion_from_matrix(camera)[:, None], _normalise_quaternion(rotations))
         colours = (images.flatten(2).transpose(1, 2) - 0.5) / SH_C0  # [views, H * W, 3]
@@ -65,6 +68,11 @@ class GaussianAdapter(nn.Module):
         rays = torch.stack([x, y, torch.ones_like(x)], dim=-1) @ invert_intrinsics(cameras.intrinsics).transpose(1, 2)
         rotation, centre = cameras.extrinsics[:, :3, :3], cameras.extrinsics[:, None, :3, 3]
         return centre + rays @ rotation.transpose(1, 2) * depth.flatten(1)[..., None]
+
+    def _pixel_sizes(self, depth: Tensor, cameras: Cameras) -> Tensor:
+        """What a pixel's width covers at its depth, [views, H * W, 1] in scene units."""
+        focal = cameras.intrinsics[:, 0, 0] * depth.shape[2]
+        return (depth.flatten(1) / focal[:, None])[..., None]
 
     def _world_harmonics(self, sh: Tensor, colours: Tensor, camera: Tensor) -> Tensor:
         """sh [views, H * W, 3, coefficients] as predicted, in the camera's frame -> [views, H * W, coefficients, 3]."""

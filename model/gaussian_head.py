@@ -51,7 +51,7 @@ class GaussianStage(nn.Module):
         parameters = BASE_PARAMETERS + 3 * config.sh_coefficients
         self.head1 = nn.Conv2d(channels, parameters, 3, padding=1, padding_mode="replicate")
         self.head2 = nn.Conv2d(parameters, parameters, 3, padding=1, padding_mode="replicate")
-        self.adapter = GaussianAdapter(config.sh_degree, config.scale_min, config.scale_max)
+        self.adapter = GaussianAdapter(config)
 
     def forward(
         self, images: Tensor, cameras: Cameras, encoded: Encoded, units: tuple[Boosted, Boosted, Boosted]

@@ -27,7 +27,7 @@ class GaussianRegressor(nn.Module):
         parameters = BASE_PARAMETERS + 3 * config.sh_coefficients
         self.head1 = nn.Conv2d(channels + 3 + features + 1, parameters, 3, padding=1, padding_mode="replicate")
         self.head2 = nn.Conv2d(parameters, parameters, 3, padding=1, padding_mode="replicate")
-        self.adapter = GaussianAdapter(config.sh_degree, config.scale_min, config.scale_max)
+        self.adapter = GaussianAdapter(config)
 
     def forward(
         self, images: Tensor, cameras: Cameras, encoded: EncodedPyramid, scales: tuple[Matched, ...]

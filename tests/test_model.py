@@ -5,8 +5,9 @@ import torch
 from conftest import SMALL, small_network
 from idesplat.export.stages import example_inputs
 from idesplat.model import geometry
-from idesplat.model.config import PRESETS
-from idesplat.model.gaussian_adapter import quaternion_from_matrix
+from idesplat.model.config import PRESETS, IDESplatConfig
+from idesplat.model.gaussian_adapter import GaussianAdapter, quaternion_from_matrix
+from idesplat.model.geometry import Cameras
 from idesplat.model.idesplat import IDESplat
 
 
@@ -101,3 +102,19 @@ def test_nearest_pixels_see_a_plane_where_it_is():
     assert (rows[0, 0, :, :4] == outside).all()
     assert (rows[1, 0, :, :-4] == pixel[:, 4:]).all()
     assert (rows[0, 1, :, 1:] == 256 + pixel[:, 1:]).all()  # far away nothing moves by as much as half a pixel
+
+
+def test_scales_in_pixels_follow_depth_and_focal_length() -> None:
+    """Where a network predicts scales in pixels, a splat covers as many of them at any depth and focal length."""
+    plain, in_pixels = (GaussianAdapter(IDESplatConfig(sh_degree=1, scale_in_pixels=flag)) for flag in (False, True))
+    torch.manual_seed(0)
+    raw, images = torch.randn(2, 22, 4, 6), torch.rand(2, 3, 4, 6)
+    depth = torch.rand(2, 4, 6) + 1
+    intrinsics = torch.tensor([[0.8, 0, 0.5], [0, 1.2, 0.5], [0, 0, 1]]).expand(2, 3, 3)
+    cameras = Cameras(torch.eye(4).expand(2, 4, 4), intrinsics, torch.ones(2), torch.full((2,), 9.0))
+    expected = plain(raw, depth, images, cameras)
+    found = in_pixels(raw, depth, images, cameras)
+    pixel = depth.reshape(-1, 1) / (0.8 * 6)
+    torch.testing.assert_close(found.scales, expected.scales * pixel)
+    for name in ("means", "quats", "opacities", "sh"):
+        assert torch.equal(getattr(found, name), getattr(expected, name))

@@ -5,14 +5,18 @@ and training first has to find both. Here queries and keys start with the same p
 as a smoothing of the correlations along the candidates, to which it learns to add. The architecture stays as it is.
 """
 
+import math
+
 import torch
 from torch import Tensor, nn
 
 from ..model.config import IDESplatConfig
 from ..model.epipolar_attention import EpipolarAttention
+from ..model.gaussian_adapter import SCALE_SHIFT
 from ..model.idesplat import IDESplat
 from ..model.mv_transformer import TransformerBlock, WindowAttention
 from ..model.unet import CostRegulariser, ResBlock
+from .losses import SPLAT_PIXELS
 
 # By how much a correlation of one deviation raises a candidate's logit, about.
 TEMPERATURE = 2.0
@@ -36,15 +40,22 @@ def new_model(config: IDESplatConfig, seed: int) -> IDESplat:
         elif isinstance(part, TransformerBlock | WindowAttention):
             nn.init.constant_(part.norm.weight, MESSAGE)
     _anchor(model.gaussians.residual, first=config.dpbus[2].channels)
-    opacity_and_more = model.gaussians.head2.bias
-    assert opacity_and_more is not None
-    with torch.no_grad():
-        opacity_and_more[0] = OPAQUE
+    _start_as_opaque_pixels(model)
     # The monocular disparity is one over this layer's output: it must start away from zero.
     bias = model.encoder.dpt.disparity3.bias
     assert bias is not None
     nn.init.ones_(bias)
     return model
+
+
+@torch.no_grad()
+def _start_as_opaque_pixels(model: IDESplat) -> None:
+    """Gaussians that hide what is behind them and, where their size is predicted in pixels, have the wanted one."""
+    bias = model.gaussians.head2.bias
+    assert bias is not None
+    bias[0] = OPAQUE
+    if model.config.scale_in_pixels:
+        bias[3:6] = SCALE_SHIFT + math.log(math.expm1(SPLAT_PIXELS))  # softplus gives it back
 
 
 @torch.no_grad()

@@ -26,7 +26,7 @@ LARGE_RELATIVE = 0.5
 LARGE_BINS = 8.0
 # Splats are asked to be about this many pixels large (their standard deviation) and opaque. Views alone settle the size
 # slowly, and answer wrong depth with splats that are half transparent, so that black shows through everywhere.
-SPLAT_PIXELS = 0.6
+SPLAT_PIXELS = 0.5
 SIZE_SHARE = 0.03
 OPACITY_SHARE = 0.1
 # The share of LPIPS beside the squared error (the papers' lambda).
