@@ -11,6 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from idesplat.export.cli import describe
+from idesplat.export.exporter import Fixed, freeze
+from idesplat.export.stages import NamedTensors
 from idesplat.model.config import (
     PRESETS,
     DepthScaleConfig,
@@ -23,6 +26,8 @@ from idesplat.model.cost_volume import by_all_scores, by_gathering, by_sampling
 from idesplat.model.geometry import Cameras, project_candidates, sampling_points, scale_intrinsics
 from idesplat.model.layers import resize
 from idesplat.model.networks import build
+from idesplat.runtime.bundle import INPUTS
+from idesplat.runtime.session import open_session, run_session
 from reference_weights import draw_tensor
 
 VIEWS = sorted((Path(__file__).parent / "data" / "depthsplat-views").glob("*.npz"))
@@ -44,7 +49,7 @@ ONE_SCALE = replace(SMALL, scales=SMALL.scales[:1])
 
 @pytest.fixture(scope="module", params=VIEWS, ids=lambda path: path.stem)
 def views(request):
-    """The release's arrays, the cameras, and what our network yields of the same views."""
+    """The release's arrays, what our network yields of the same views, the network and its inputs."""
     with np.load(request.param) as file:
         expected = {name: torch.from_numpy(file[name]) for name in file.files}
     preset, _, size = request.param.stem.rsplit("-", 2)
@@ -55,11 +60,11 @@ def views(request):
     drawn = {name: draw_tensor(name, shape, seed, gain).astype(np.float32) for name, shape in shapes.items()}
     model.load_state_dict({name: torch.from_numpy(value) for name, value in drawn.items()})
     images = resize(expected["thumbnails"] / 255, *map(int, size.split("x")))
-    cameras = Cameras(*(expected[name] for name in ("extrinsics", "intrinsics", "near", "far")))
+    cameras = [expected[name] for name in INPUTS[1:]]
     with torch.no_grad():
-        encoded, scales = model.depth_stages(images, cameras)
+        encoded, scales = model.depth_stages(images, Cameras(*cameras))
         features = model.gaussians.upsampler(encoded, [scale.features_mv for scale in scales])
-    return expected, encoded, scales, features
+    return expected, encoded, scales, features, model, [images, *cameras]
 
 
 def test_all_strides_and_scales_are_covered():
@@ -67,20 +72,32 @@ def test_all_strides_and_scales_are_covered():
 
 
 def test_matching_features_of_several_views(views):
-    expected, encoded, _, _ = views
+    expected, encoded, *_ = views
     reference = expected["features_mv"]
     assert (encoded.features_mv[..., ::3, ::3] - reference).abs().max() < 1e-4 * reference.std()
 
 
-def test_depth_of_several_views(views):
-    expected, _, scales, _ = views
-    error = (1 / scales[-1].inverse_depth_full[:, 0, ::3, ::3] - expected["depth"]).abs() / expected["depth"]
+def check_depth(depth, expected):
+    error = (depth[:, ::3, ::3] - expected["depth"]).abs() / expected["depth"]
     assert error.median() < 1e-5
     assert error.max() < 1e-3
 
 
+def test_depth_of_several_views(views):
+    expected, _, scales, *_ = views
+    check_depth(1 / scales[-1].inverse_depth_full[:, 0], expected)
+
+
+def test_depth_of_several_views_in_onnx_runtime(views, tmp_path):
+    """The graph is traced at four views and another size."""
+    expected, *_, model, inputs = views
+    graphs = freeze(NamedTensors(model), describe(model, "", "", "", Fixed()), Fixed(), tmp_path)
+    feeds = {name: value.numpy() for name, value in zip(INPUTS, inputs, strict=True)}
+    check_depth(torch.from_numpy(run_session(open_session(graphs.whole), feeds)["depth"]), expected)
+
+
 def test_upsampled_features(views):
-    expected, _, _, features = views
+    expected, _, _, features, *_ = views
     reference = expected["features"]
     assert (features[..., ::12, ::12] - reference).abs().max() < 1e-4 * reference.std()
 
