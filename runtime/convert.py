@@ -16,7 +16,8 @@ def convert(
 ) -> None:
     """Write a splat file in another format, which follows from the file's name.
 
-    .ply, .compressed.ply, .splat, .spz, .sog and .glb are read and written. What a format cannot hold is named.
+    .ply, .compressed.ply, .splat, .spz, .sog and .glb are read and written; .points.ply, .points.glb, .obj and .xyz are
+    written as points. What a format cannot hold is named.
     """
     from .files import check_writable
     from .formats import read_scene, scene_suffix, write_scene

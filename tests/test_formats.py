@@ -297,6 +297,21 @@ def test_the_command_goes_all_the_way_round(
     assert "note: spherical harmonics of degree 1 to 2 left out" in capsys.readouterr().out
 
 
+def test_the_command_leaves_out_what_is_faint(
+    tmp_path: Path, truth: Gaussians, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_ply(Path("a.ply"), truth)
+    kept = truth.opacities >= 0.3
+    assert run_command(convert, "a.ply", "b.glb", "--min-opacity", "0.3") == 0
+    assert f"cleaned: {(~kept).sum()} too faint; {kept.sum()} Gaussians left" in capsys.readouterr().out
+    np.testing.assert_array_equal(read_scene(Path("b.glb")).means, truth.means[kept])
+    for value, message in (("1", "--min-opacity 1: no Gaussian is left of 270"), ("nan", "--min-opacity nan")):
+        assert run_command(convert, "a.ply", "c.glb", "--min-opacity", value) == 2
+        assert message in capsys.readouterr().err
+    assert not Path("c.glb").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
