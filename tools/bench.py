@@ -30,7 +30,7 @@ if TYPE_CHECKING:  # nothing heavy is loaded before there is something to measur
 WORSE = 1  # exit status where --compare finds something that became worse
 INTERRUPTED = 130
 FEWEST_VIEWS = 2
-EAGER = "PyTorch eager"
+EAGER = "PyTorch"
 # Threads that have done their work keep spinning for a while; nobody should run beside them.
 SETTLE_SECONDS = 0.25
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
@@ -295,7 +295,7 @@ def _network_rows(rows: "Sequence[Row]", workload: "Workload", settings: Setting
     from .bench_report import Row
 
     presets = dict.fromkeys(row.preset for row in rows if row.preset in PRESETS)
-    return [Row(EAGER, preset, "float32", "CPU", **asdict(workload)) for preset in presets if settings.eager]
+    return [Row(f"{EAGER} {preset}", preset, "float32", "CPU", **asdict(workload)) for preset in presets if settings.eager]
 
 
 # ---- around it
