@@ -295,7 +295,9 @@ def _network_rows(rows: "Sequence[Row]", workload: "Workload", settings: Setting
     from .bench_report import Row
 
     presets = dict.fromkeys(row.preset for row in rows if row.preset in PRESETS)
-    return [Row(f"{EAGER} {preset}", preset, "float32", "CPU", **asdict(workload)) for preset in presets if settings.eager]
+    return [
+        Row(f"{EAGER} {preset}", preset, "float32", "CPU", **asdict(workload)) for preset in presets if settings.eager
+    ]
 
 
 # ---- around it
