@@ -1,17 +1,20 @@
 """The README's table of supported checkpoints, every number of it measured where this runs.
 
     python -m idesplat.tools.checkpoint_table
-    python -m idesplat.tools.checkpoint_table depthsplat-small-re10k depthsplat-base-re10k --threads 1
+    python -m idesplat.tools.checkpoint_table depthsplat-small-re10k depthsplat-base-re10k
 
 Each preset's weights are drawn at random and exported by idesplat-export, and what comes of it is run, each in a
 process of its own. Time and memory do not depend on the weights. Parity is, if anything, worse than with trained ones,
-since the features of neighbouring pixels then have nothing in common.
+since the features of neighbouring pixels then have nothing in common. Seconds are a processor's on one thread, which do
+not change when others use the machine, too.
 """
 
 import contextlib
 import math
 import os
 import tempfile
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -21,11 +24,11 @@ import torch
 import typer
 
 from ..export.cli import export
-from ..model.config import PRESETS
+from ..model.config import PRESETS, IDESplatConfig
 from ..model.networks import Network, build
 from ..runtime.errors import InputError, exit_on_input_error
 from ..runtime.scene_frame import SceneFrame
-from ..runtime.session import CPU, usable_cores
+from ..runtime.session import CPU
 from .bench import thread_environment
 from .bench_worker import Failed, Prepared, Worker, Workload, example_arrays, exported
 
@@ -52,6 +55,7 @@ VIEWS = 2
 WITHIN = 1e-3
 COLUMNS = (
     "checkpoint",
+    "family",
     "preset",
     "parameters",
     "trained at",
@@ -67,7 +71,7 @@ GB = 1e9
 
 @dataclass(frozen=True)
 class Measured:
-    """What is measured of one preset: on two views of the trained size, and of its export."""
+    """What is measured of one preset on two views of the trained size, and of its export."""
 
     parameters: int
     share: float  # of depths within `WITHIN` of PyTorch's, relative
@@ -84,7 +88,6 @@ def table(
     presets: Annotated[
         list[str] | None, typer.Argument(help="Presets instead of all released ones.", show_default=False)
     ] = None,
-    threads: Annotated[int | None, typer.Option(help="Threads, instead of one a core.", min=1)] = None,
     repeats: Annotated[int, typer.Option(help="Runs, of which the median counts.", min=1)] = 3,
 ) -> None:
     """Print a row of Markdown for each preset as soon as it is measured."""
@@ -92,10 +95,10 @@ def table(
         if name not in RELEASED:
             raise InputError(f"{name}: unknown preset; choose of {', '.join(RELEASED)}")
     print("| " + " | ".join(COLUMNS) + " |\n|" + "---|" * len(COLUMNS))
-    with thread_environment(threads or usable_cores()):
+    with thread_environment(1):
         for name in presets or RELEASED:
             try:
-                print(row(name, measure(name, threads or usable_cores(), repeats)), flush=True)
+                print(row(name, measure(name, repeats)), flush=True)
             except Failed as error:
                 raise InputError(f"{name}: {error}") from None
 
@@ -106,6 +109,7 @@ def row(preset: str, found: Measured) -> str:
     fewest, most = config.trained_views
     cells = (
         f"`{RELEASED[preset]}`",
+        "IDESplat" if isinstance(config, IDESplatConfig) else "DepthSplat",
         f"`{preset}`",
         f"{found.parameters / 1e6:.1f} M",
         f"{config.height}x{config.width}",
@@ -119,19 +123,19 @@ def row(preset: str, found: Measured) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def measure(preset: str, threads: int, repeats: int) -> Measured:
+def measure(preset: str, repeats: int) -> Measured:
     """Draw a checkpoint, export it and run what comes of it. Raises Failed if that cannot be done."""
     config = PRESETS[preset]
     workload = Workload(VIEWS, config.height, config.width)
     with tempfile.TemporaryDirectory() as folder:
         checkpoint, model = Path(folder) / "drawn.pth", Path(folder) / "model.onnx"
-        with Worker(drawn, preset, checkpoint, workload, threads) as worker:
+        with Worker(drawn, preset, checkpoint, workload) as worker:
             parameters, depth = worker.about
-        with Worker(exporting, checkpoint, preset, model, threads) as worker:
-            export_seconds = worker.run().seconds
+        with Worker(exporting, checkpoint, preset, model) as worker:
+            export_seconds = worker.run().result
             export_peak = worker.finish()
-        with Worker(exported, model, CPU, threads, workload) as worker:
-            seconds = float(np.median([worker.run().seconds for _ in range(repeats)]))
+        with Worker(running, model, workload) as worker:
+            seconds = float(np.median([worker.run().result for _ in range(repeats)]))
             error = np.abs(worker.about["depth"] - depth) / depth
             peak = worker.finish()
         size = sum(path.stat().st_size for path in Path(folder).glob("model.onnx*"))
@@ -142,9 +146,8 @@ def measure(preset: str, threads: int, repeats: int) -> Measured:
 # ---- what runs in processes of its own
 
 
-def drawn(preset: str, checkpoint: Path, workload: Workload, threads: int) -> Prepared:
+def drawn(preset: str, checkpoint: Path, workload: Workload) -> Prepared:
     """Write drawn weights; `about` holds how many they are, and the depth that PyTorch makes of them."""
-    torch.set_num_threads(threads)
     network = build(preset).eval()
     draw(network)
     torch.save({"state_dict": network.state_dict()}, checkpoint)
@@ -157,15 +160,35 @@ def drawn(preset: str, checkpoint: Path, workload: Workload, threads: int) -> Pr
     return (count, frame.leave_depth(depth)), dict
 
 
-def exporting(checkpoint: Path, preset: str, model: Path, threads: int) -> Prepared:
-    """The command idesplat-export, with what it prints left out."""
-    torch.set_num_threads(threads)
+def exporting(checkpoint: Path, preset: str, model: Path) -> Prepared:
+    """The command idesplat-export, with what it prints left out; a run gives its processor seconds."""
+
+    # ONNX Runtime takes as many threads as there are cores to run on, and its idle ones would count as well.
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 
     def run() -> None:
         with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
             export(checkpoint, model, preset=preset)
 
-    return None, run
+    return None, _timed(run)
+
+
+def running(model: Path, workload: Workload) -> Prepared:
+    """The exported model; `about` holds the depth that it predicts, and a run gives its processor seconds."""
+    about, run = exported(model, CPU, 1, workload)
+    return about, _timed(run)
+
+
+def _timed(run: Callable[[], object]) -> Callable[[], float]:
+    """What runs something and says how long the processor worked on it."""
+
+    def timed() -> float:
+        started = time.process_time()
+        run()
+        return time.process_time() - started
+
+    return timed
 
 
 def draw(network: Network, seed: int = 0) -> None:
