@@ -21,7 +21,7 @@ def demo(out: Annotated[Path, typer.Argument(help="Folder for everything.")] = P
     make_scene(scene, seed=2, views=8, height=480, width=640)
     infer(
         images=[scene / "images"],
-        cameras=scene / "transforms.json",
+        cameras=str(scene / "transforms.json"),
         out=out / "scene.ply",
         save_depth=out / "depth",
         render=out / "views",
