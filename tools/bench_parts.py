@@ -202,7 +202,7 @@ def _files(folder: Path, verb: str) -> Contestants:
 
 def plain_file(folder: Path, verb: str) -> Prepared:
     """Bytes without a meaning: what the disk and the memory take."""
-    path, table = folder / "plain.bin", np.zeros((FILE_SPLATS, PLY_COLUMNS), np.float32)
+    path, table = folder / "plain.bin", np.random.default_rng(0).random((FILE_SPLATS, PLY_COLUMNS), np.float32)
 
     def write() -> None:
         table.tofile(path)
