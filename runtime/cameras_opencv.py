@@ -35,8 +35,8 @@ def read(path: Path, pictures: Sequence[Path] = ()) -> list[Camera]:
             f"calibrates two cameras, and {len(pictures)} images were given; give the left and the right one"
         )
     fields = _fields(path)
-    other = path.with_stem(OTHER_HALF.get(path.stem, ""))
-    if other.is_file():
+    other = path.with_stem(OTHER_HALF.get(path.stem, path.stem))
+    if other != path and other.is_file():
         with located(other.name):
             fields = {**_fields(other), **fields}
     pose = np.eye(4)

@@ -358,7 +358,8 @@ def test_stereo_calibration(tmp_path, suffix, size):
 @pytest.mark.parametrize("names", [("K{}", "D{}", "R", "T"), ("cameraMatrix{}", "distCoeffs{}", "R", "T")])
 def test_stereo_calibration_by_other_names(tmp_path, names):
     write_stereo(tmp_path / "s.yml", names, "numbers", rotation=cv2.Rodrigues(STEREO[:3, :3])[0])
-    assert_stereo(read_cameras(tmp_path / "s.yml"))
+    (tmp_path / "s.yml").rename(tmp_path / "stereo")  # the content tells what it is
+    assert_stereo(read_cameras(tmp_path / "stereo"))
 
 
 def test_stereo_calibration_in_two_files(tmp_path):
