@@ -50,8 +50,10 @@ def infer(
         ),
     ],
     out: Annotated[Path, typer.Option(help=OUT_HELP, show_default=False)],
-    model: Annotated[Path, typer.Option(help="A .onnx or staged folder of idesplat-export.", show_default=False)],
     more_images: Annotated[list[Path] | None, typer.Argument(hidden=True)] = None,
+    model: Annotated[
+        Path | None, typer.Option(help="A .onnx or staged folder of idesplat-export instead of the carried model.")
+    ] = None,
     camera_format: Annotated[
         CameraFormat | None, typer.Option(help="Format of the cameras, where their content does not tell it.")
     ] = None,
@@ -109,6 +111,7 @@ def infer(
     """Turn posed photographs into a 3D Gaussian splat that every viewer opens."""
     from .cameras import write_cameras
     from .cleaning import Cleaning
+    from .default_model import default_model
     from .formats import holds_splats, is_surface
     from .inputs import Request, read_inputs
     from .progress import working
@@ -120,7 +123,7 @@ def infer(
     cleaning = Cleaning(min_opacity, trim_border, trim_edges, min_confidence, merge_duplicates)
     given = Request([*images, *(more_images or [])], cameras, camera_format, focal, frames, views, size)
     with working("loading the model"):
-        runner = Runner(model, provider)
+        runner = Runner(model or default_model(), provider)
     _check_fit(runner, out, cleaning, {"--render": render, "--report": report})
     inputs = read_inputs(given, runner)
     prepared = inputs.views
