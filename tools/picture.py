@@ -30,9 +30,11 @@ def picture(
     cameras = read_cameras(scene / "transforms.json")
     runner = Runner(default_model())
     height, width = runner.size_for(cameras)
-    views = prepare([(scene / cameras[view].name, cameras[view]) for view in (*CONTEXT, BETWEEN)], None, height, width)
-    count = len(CONTEXT)
-    found = runner.predict_arrays(views.images[:count], views.extrinsics[:count], views.intrinsics[:count])
+    pairs = [(scene / cameras[view].name, cameras[view]) for view in (*CONTEXT, BETWEEN)]
+    given = prepare(pairs[: len(CONTEXT)], None, height, width)
+    span = runner.depth_range(given)
+    found = runner.predict_arrays(given.images, given.extrinsics, given.intrinsics, span.near, span.far)
+    views = prepare(pairs, None, height, width)
     pixels = views.intrinsics[-1].astype(np.float64) * np.array([width, height, 1.0])[:, None]
     between = draw_view(found.need_gaussians(), views.extrinsics[-1], pixels, width, height).rgb
     first, second, truth = views.images.transpose(0, 2, 3, 1)
