@@ -40,7 +40,7 @@ def export(
 
     Views, height and width stay dynamic unless fixed by --views and --size.
     """
-    _check_targets(out, staged)
+    folder = _check_targets(out, staged)
     if find_spec("torch") is None or find_spec("onnx") is None:
         raise InputError("exporting needs PyTorch and onnx, which are not installed; pip install 'idesplat[export]'")
     from ..model.checkpoint import CheckpointError
@@ -52,7 +52,7 @@ def export(
         raise InputError(str(error)) from None
     fixed = Fixed(views, _fitting_size(size, model.config.size_multiple) if size else None)
     description = describe(model, name, checkpoint.name, digest, fixed)
-    if not _export(model, description, fixed, out, staged):
+    if not _export(model, description, fixed, folder, out, staged):
         print("error: the graph departs from the network (see the table); nothing was written", file=sys.stderr)
         raise SystemExit(PARITY_BREACH)
 
@@ -62,9 +62,10 @@ def main() -> None:
     typer.run(export)
 
 
-def _check_targets(out: Path | None, staged: Path | None) -> None:
-    """Find out before minutes of work whether the results can be written."""
-    if out is None and staged is None:
+def _check_targets(out: Path | None, staged: Path | None) -> Path:
+    """Find out before minutes of work whether the results can be written; the folder of the first of them."""
+    folders = [path.parent for path in (out, staged) if path is not None]
+    if not folders:
         raise InputError("nothing to write: give OUT.onnx, or --staged DIR, or both")
     if out is not None:
         if out.suffix != ".onnx":
@@ -76,6 +77,7 @@ def _check_targets(out: Path | None, staged: Path | None) -> None:
         if staged.is_dir() and any(staged.iterdir()) and not (staged / MANIFEST_NAME).is_file():
             raise InputError(f"--staged {staged}: holds other files; choose an empty or new folder")
         check_writable(make_folder(staged.parent))
+    return folders[0]
 
 
 def _fitting_size(text: str, multiple: int) -> tuple[int, int]:
@@ -133,8 +135,13 @@ def describe(model: "Network", preset: str, checkpoint: str, digest: str, fixed:
     )
 
 
-def _export(model: "Network", description: Description, fixed: "Fixed", out: Path | None, staged: Path | None) -> bool:
-    """Trace, verify and write; False and nothing written if the graph departs from the network."""
+def _export(
+    model: "Network", description: Description, fixed: "Fixed", folder: Path, out: Path | None, staged: Path | None
+) -> bool:
+    """Trace, verify and write; False and nothing written if the graph departs from the network.
+
+    The work is done in a folder beside the results: a system's own for temporary files may lie in memory.
+    """
     from rich.console import Console
 
     from .exporter import OPSET, freeze
@@ -144,10 +151,9 @@ def _export(model: "Network", description: Description, fixed: "Fixed", out: Pat
 
     console = Console(stderr=True)
     network = NamedTensors(model)
-    # Beside the results, where there must be room for them; a system's folder for temporary files may lie in memory.
-    with tempfile.TemporaryDirectory(prefix=".idesplat-export.", dir=(out or staged or Path()).parent) as folder:
+    with tempfile.TemporaryDirectory(prefix=".idesplat-export.", dir=folder) as working:
         with console.status("tracing the network (a minute or so)"):
-            graphs = freeze(network, description, fixed, Path(folder))
+            graphs = freeze(network, description, fixed, Path(working))
         print(f"traced: {graphs.nodes} nodes, opset {OPSET}, {graphs.bytes / 1e6:.0f} MB")
         rows = []
         with console.status("verifying against PyTorch") as status:

@@ -45,7 +45,7 @@ def hand_out(graph: Path, out: Path) -> list[Path]:
             temporary.write_bytes(model.SerializeToString())
         return [out]
     beside = out.with_name(out.name + BESIDE)
-    with replacing(beside) as weights, replacing(out) as temporary:
+    with replacing(out) as temporary, replacing(beside) as weights:  # the last comes first into its place
         with weights.open("wb") as file:
             for tensor in _outside(model):
                 values = _values(tensor, graph.parent)

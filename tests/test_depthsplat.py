@@ -142,7 +142,7 @@ def test_depth_only_network_gives_the_same_depth():
     alone.load_state_dict({k: v for k, v in whole.state_dict().items() if not k.startswith("gaussians.")})
     inputs = scene(2, 32, 48)
     with torch.no_grad():
-        torch.testing.assert_close(alone(*inputs), whole(*inputs).depth)
+        torch.testing.assert_close(alone(*inputs).depth, whole(*inputs).depth)
 
 
 @pytest.mark.parametrize("form", (by_sampling, by_all_scores, by_gathering))
