@@ -5,7 +5,8 @@ import numpy as np
 FEWEST_POINTS = 20  # to be believed
 NEAREST_SHARE, FARTHEST_SHARE = 2, 98  # percentiles: a few points are wrong
 # What has no points may lie before the nearest and behind the farthest. On a hundred procedural scenes with true depth
-# this leaves 4 % of the pixels out (0.7 and 1.5 would leave 7 %), and the range of inverse depth is 1.8 times the true one.
+# this leaves 4 % of the pixels out (0.7 and 1.5 would leave 7 %), and the range of inverse depth is 1.8 times the true
+# one.
 NEAR_ROOM, FAR_ROOM = 0.5, 2.0
 
 
