@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 from idesplat.model.checkpoint import fill
-from idesplat.model.config import PRESETS
+from idesplat.model.config import PRESETS, IDESplatConfig
 from idesplat.model.dpbu import Cameras
 from idesplat.model.gaussian_adapter import GaussianAdapter, WorldGaussians
 from idesplat.model.idesplat import IDESplat
@@ -131,7 +131,7 @@ def test_adapter_matches_on_the_references_own_parameters(case):
     step = torch.lcm(torch.tensor(strides["gaussian_raw"]), torch.tensor(4)).item()
     raw, depth = torch.zeros_like(found["gaussian_raw"]), expected["depth"]
     raw[..., :: strides["gaussian_raw"], :: strides["gaussian_raw"]] = expected["stage/gaussian_raw"]
-    gaussians = GaussianAdapter(2, 1e-10, 3.0)(raw, depth, expected["image"] / 255, cameras)
+    gaussians = GaussianAdapter(IDESplatConfig())(raw, depth, expected["image"] / 255, cameras)
     ours = WorldGaussians(*(x.unflatten(0, depth.shape)[:, ::step, ::step].flatten(0, 2) for x in gaussians))
     views, height, width = depth.shape
     fourth = (views, -(-height // 4), -(-width // 4))
