@@ -11,7 +11,8 @@ import torch
 
 from ..runtime.bundle import INPUTS, METADATA_KEY, OUTPUTS, Description
 from .optimize import simplify
-from .stages import NamedTensors, Stage, example_inputs, find_stages
+from .sparse_products import explain, in_steps
+from .stages import NamedTensors, Stage, example_inputs, find_stages, stage_graph
 from .weights import fill_inputs
 
 OPSET = 20
@@ -72,7 +73,7 @@ def freeze(network: NamedTensors, description: Description, fixed: Fixed, folder
     graphs = Graphs(folder, find_stages(traced, network.stages), len(whole.graph.node))
     _write(whole, description, graphs.whole)
     for stage in graphs.stages:
-        _write(_stage_graph(traced, stage), description, graphs.of_stage(stage))
+        _write(stage_graph(traced, stage), description, graphs.of_stage(stage))
     return graphs
 
 
@@ -88,7 +89,7 @@ def trace(network: NamedTensors, description: Description, fixed: Fixed, folder:
     height, width = fixed.size or (TRACE_BLOCKS[0] * multiple, TRACE_BLOCKS[1] * multiple)
     inputs = tuple(example_inputs(views, height, width, description.near, description.far).values())
     path, weights = folder / TRACED, folder / TRACED_WEIGHTS
-    with warnings.catch_warnings(), torch.no_grad():
+    with warnings.catch_warnings(), torch.no_grad(), in_steps(network):
         warnings.simplefilter("ignore")  # deprecation of the path, and tracing warnings on sizes fixed on purpose
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)
         shapes = {name: tuple(tensor.shape) for name, tensor in network.named(*inputs).items()}
@@ -105,7 +106,7 @@ def trace(network: NamedTensors, description: Description, fixed: Fixed, folder:
             output_names=list(shapes),
             dynamic_axes=axes,
         )
-    traced = onnx.load(path)
+    traced = explain(onnx.load(path))
     fill_inputs(traced, [*network.named_parameters(), *network.named_buffers()], weights)
     path.write_bytes(traced.SerializeToString())
     model = simplify(path, folder / WEIGHTS)
@@ -149,10 +150,6 @@ def _whole_graph(traced: onnx.ModelProto) -> onnx.ModelProto:
     del model.graph.output[:]
     model.graph.output.extend(sorted(outputs, key=lambda output: OUTPUTS.index(output.name)))
     return model
-
-
-def _stage_graph(traced: onnx.ModelProto, stage: Stage) -> onnx.ModelProto:
-    return onnx.utils.Extractor(traced).extract_model(list(stage.inputs), list(stage.outputs))
 
 
 def _write(model: onnx.ModelProto, description: Description, path: Path) -> None:

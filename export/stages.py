@@ -55,7 +55,6 @@ class NamedTensors(nn.Module):
 
 def find_stages(traced: onnx.ModelProto, names: list[str]) -> list[Stage]:
     """The stages of a traced graph in the order in which they run, each with what it reads and what is read of it."""
-    producers = {output: node for node in traced.graph.node for output in node.output}
     named = [output.name for output in traced.graph.output]
     results = [name for name in named if "." not in name]  # the last stage's
     needed, stages = set(results), []
@@ -63,23 +62,49 @@ def find_stages(traced: onnx.ModelProto, names: list[str]) -> list[Stage]:
         own = results if stage == names[-1] else [name for name in named if name.startswith(f"{stage}.")]
         outputs = [name for name in own if name in needed]
         borders = {*INPUTS, *named} - set(own)
-        read = _reached(outputs, borders, producers)
+        read = nodes_between(traced, borders, outputs)[1]
         stages.append(Stage(stage, tuple(name for name in (*INPUTS, *named) if name in read), tuple(outputs)))
         needed |= read
     return stages[::-1]
 
 
-def _reached(outputs: Iterable[str], borders: set[str], producers: dict[str, onnx.NodeProto]) -> set[str]:
-    """The border tensors that are met first on every way back from the outputs."""
-    met, seen, open_names = set(), set(), list(outputs)
+def stage_graph(traced: onnx.ModelProto, stage: Stage) -> onnx.ModelProto:
+    """The part of a traced graph that a stage is, as a graph of its own."""
+    nodes, _ = nodes_between(traced, set(stage.inputs), stage.outputs)
+    read = {name for node in nodes for name in names_read(node)} | set(stage.outputs)
+    values = {value.name: value for value in (*traced.graph.input, *traced.graph.output)}
+    inputs, outputs = ([values[name] for name in names] for names in (stage.inputs, stage.outputs))
+    weights = [weight for weight in traced.graph.initializer if weight.name in read]
+    graph = onnx.helper.make_graph(nodes, stage.name, inputs, outputs, weights)
+    return onnx.helper.make_model(graph, opset_imports=traced.opset_import)
+
+
+def nodes_between(
+    traced: onnx.ModelProto, borders: set[str], outputs: Iterable[str]
+) -> tuple[list[onnx.NodeProto], set[str]]:
+    """The nodes on every way back from `outputs` to the first border tensors, in their order, and those tensors."""
+    producers = {output: index for index, node in enumerate(traced.graph.node) for output in node.output}
+    met, found, open_names = set(), set(), list(outputs)
     while open_names:
         name = open_names.pop()
         if name in borders:
             met.add(name)
-        elif name not in seen and name in producers:
-            seen.add(name)
-            open_names.extend(producers[name].input)
-    return met
+        elif name in producers and producers[name] not in found:
+            found.add(producers[name])
+            open_names.extend(names_read(traced.graph.node[producers[name]]))
+    return [traced.graph.node[index] for index in sorted(found)], met
+
+
+def names_read(node: onnx.NodeProto) -> set[str]:
+    """The tensors that a node reads, those included that the graphs inside it take from around it."""
+    read = set(node.input)
+    for attribute in node.attribute:
+        if attribute.type == onnx.AttributeProto.GRAPH:
+            inner = attribute.g
+            own = {value.name for value in (*inner.input, *inner.initializer)}
+            own.update(name for step in inner.node for name in step.output)
+            read.update(name for step in inner.node for name in names_read(step) if name not in own)
+    return read - {""}
 
 
 def example_inputs(views: int, height: int, width: int, near: float, far: float) -> dict[str, Tensor]:

@@ -1,25 +1,26 @@
 """How well each pixel matches its neighbours at each candidate depth, by bilinear warping (plane sweep).
 
-Three forms of the same sums. PyTorch has an operator that samples features, which are then scored. In ONNX it is called
+Two forms of the same sums. PyTorch has an operator that samples features, which are then scored. In ONNX it is called
 GridSample, slow on CPUs and missing elsewhere. Interpolation and inner product commute, so a graph scores whole pixels
 first and interpolates between four scores.
 """
+
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from .epipolar_attention import correlate
 from .geometry import Cameras, sampling_points, scale_intrinsics
 from .layers import fixed, repeat_views, to_tokens
+from .sparse_products import SparseProducts
 
-# With more candidates than this, scoring all pixels is less work than gathering those around every candidate.
-FEW_CANDIDATES = 64
-# Parts in which a view's pixels are scored with all others, so that the scores stay within a processor's cache.
-PARTS = 16
+CORNERS = 4  # pixels around a point
 
 
-def cost_volume(features: Tensor, candidates: Tensor, cameras: Cameras, neighbours: Tensor) -> Tensor:
+def cost_volume(
+    features: Tensor, candidates: Tensor, cameras: Cameras, neighbours: Tensor, products: SparseProducts
+) -> Tensor:
     """Correlation of features [views, channels, h, w] with those of the neighbours, warped: [views, candidates, h, w].
 
     candidates: inverse depths [views, candidates, h, w]. neighbours: [views, n]; their costs are averaged.
@@ -30,11 +31,11 @@ def cost_volume(features: Tensor, candidates: Tensor, cameras: Cameras, neighbou
     channels, count = fixed(features.shape[1]), fixed(candidates.shape[1])
     intrinsics = scale_intrinsics(cameras.intrinsics, height, width)
     x, y = sampling_points(candidates, intrinsics, cameras.extrinsics, neighbours)
-    if not torch.onnx.is_in_onnx_export():
-        form = by_sampling
+    if torch.onnx.is_in_onnx_export():
+        scores = by_gathering(features, neighbours, x, y, products)
     else:
-        form = by_all_scores if count > FEW_CANDIDATES else by_gathering
-    scores = form(features, neighbours, x, y) * channels**-0.5
+        scores = by_sampling(features, neighbours, x, y)
+    scores = scores * channels**-0.5
     return scores.reshape(views, -1, count, height * width).mean(1).reshape(-1, count, height, width)
 
 
@@ -47,29 +48,15 @@ def by_sampling(features: Tensor, neighbours: Tensor, x: Tensor, y: Tensor) -> T
     return (warped * own).sum(1)
 
 
-def by_all_scores(features: Tensor, neighbours: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """The same by one matrix product: the scores with all pixels of the neighbours, of which those around are kept."""
-    pixels = features.shape[2] * features.shape[3]
-    own = repeat_views(to_tokens(features), neighbours.shape[1])  # [pairs, h * w, channels]
-    others = bordered(features).flatten(2)[neighbours].flatten(0, 1)  # [pairs, channels, bordered pixels]
-    corners, across, down = corners_around(x.transpose(1, 2), y.transpose(1, 2), *features.shape[2:])
-    parts = []
-    for part in range(PARTS):
-        some = slice(pixels * part // PARTS, pixels * (part + 1) // PARTS)
-        scores = own[:, some] @ others  # [pairs, some, bordered pixels]
-        around = [scores.gather(2, corner[:, some]) for corner in corners]
-        parts.append(interpolate(around, across[:, some], down[:, some]))
-    return torch.cat(parts, dim=1).transpose(1, 2)
-
-
-def by_gathering(features: Tensor, neighbours: Tensor, x: Tensor, y: Tensor) -> Tensor:
+def by_gathering(features: Tensor, neighbours: Tensor, x: Tensor, y: Tensor, products: SparseProducts) -> Tensor:
     """The same by gathering the features of the four pixels around each candidate."""
     own = repeat_views(to_tokens(features), neighbours.shape[1])  # [pairs, h * w, channels]
-    tokens = to_tokens(bordered(features))  # [views, bordered pixels, channels]
-    first = (neighbours.flatten() * tokens.shape[1])[:, None, None]
+    table = to_tokens(bordered(features))  # [views, bordered pixels, channels]
+    first = (neighbours.flatten() * table.shape[1]).to(torch.int32)[:, None, None]
     corners, across, down = corners_around(x, y, *features.shape[2:])
-    around = [correlate(own, tokens.flatten(0, 1), first + corner) for corner in corners]
-    return interpolate(around, across, down)
+    rows = torch.cat([first + corner for corner in corners], dim=1)  # [pairs, 4 * candidates, h * w]
+    scores = products.correlate(own, table.flatten(0, 1), rows)
+    return interpolate(scores.split(fixed(x.shape[1]), dim=1), across, down)
 
 
 def bordered(features: Tensor) -> Tensor:
@@ -81,11 +68,11 @@ def corners_around(x: Tensor, y: Tensor, height: int, width: int) -> tuple[list[
     """The four pixels around x and y as indices of a bordered map, upper ones first, and the way from left and top."""
     left, top = x.floor().clamp(max=width - 1), y.floor().clamp(max=height - 1)
     row = width + 2
-    upper_left = ((top + 1) * row + left + 1).long()
+    upper_left = ((top + 1) * row + left + 1).to(torch.int32)
     return [upper_left, upper_left + 1, upper_left + row, upper_left + row + 1], x - left, y - top
 
 
-def interpolate(around: list[Tensor], across: Tensor, down: Tensor) -> Tensor:
+def interpolate(around: Sequence[Tensor], across: Tensor, down: Tensor) -> Tensor:
     """Bilinear interpolation between what `corners_around` orders."""
     upper_left, upper_right, lower_left, lower_right = around
     upper = upper_left + across * (upper_right - upper_left)

@@ -7,10 +7,11 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .config import DepthSplatConfig
-from .cost_volume import cost_volume
+from .cost_volume import CORNERS, cost_volume
 from .encoder import EncodedPyramid
 from .geometry import Cameras
 from .layers import Upsample2x, resize, softmax
+from .sparse_products import SparseProducts
 from .unet import CostRegulariser
 from .upsampler import DepthUpsampler
 
@@ -41,7 +42,9 @@ class DepthStage(nn.Module):
         self.candidates = config.scales[scale].candidates
         self.stride = config.feature_stride // 2**scale
         cnn = (config.feature_channels, config.backbone_channels[1])[scale]
-        inputs = self.candidates + cnn + config.feature_channels // 2**scale + config.vit.dim // 2**scale
+        matching = config.feature_channels // 2**scale
+        self.products = SparseProducts(CORNERS * self.candidates * matching)
+        inputs = self.candidates + cnn + matching + config.vit.dim // 2**scale
         self.regulariser = CostRegulariser(inputs, unet.channels, unet)
         self.shortcut = nn.Conv2d(inputs, unet.channels, 1)
         self.head1 = nn.Conv2d(unet.channels, 2 * unet.channels, 3, padding=1, padding_mode="replicate")
@@ -52,7 +55,7 @@ class DepthStage(nn.Module):
         self, cnn: Tensor, mv: Tensor, mono: Tensor, candidates: Tensor, cameras: Cameras, neighbours: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Three maps [views, channels, h, w] and candidate inverse depths -> inverse depth and probability."""
-        costs = cost_volume(mv, candidates, cameras, neighbours)
+        costs = cost_volume(mv, candidates, cameras, neighbours, self.products)
         known = torch.cat([costs, cnn, mv, mono], dim=1)
         regular = self.regulariser.scores(known, known.shape[0]) + self.shortcut(known)
         probability = softmax(self.head2(F.gelu(self.head1(regular))), dim=1)

@@ -1,18 +1,16 @@
 """One warp-index epipolar attention layer: pixels attend to where their depth candidates fall in other views.
 
-The releases multiply sparsely in a CUDA extension; here the same sums run over integer gathers of feature rows.
+The releases multiply sparsely in a CUDA extension; here the same sums run over gathered rows (sparse_products.py).
 """
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .config import DPBUConfig
 from .layers import ConvFFN, fixed, repeat_views, to_map, to_tokens
+from .sparse_products import SparseProducts, pixel_table
 from .unet import CostRegulariser
 
-# Candidates gathered at once: it bounds the memory to this many copies of the features.
-CHUNK = 8
 # Keeps the renormalised product of probabilities away from zero.
 EPSILON = 1e-10
 
@@ -24,8 +22,7 @@ class EpipolarAttention(nn.Module):
         super().__init__()
         channels, candidates = config.channels, config.candidates
         self.scale = channels**-0.5
-        # The two sparse products; training on a CPU puts compiled ones in their place.
-        self.correlate, self.weigh = correlate, weigh
+        self.products = SparseProducts(channels * candidates)
         # Position embeddings of the candidates, for keys, values and scores.
         self.key_position = nn.Parameter(torch.zeros(candidates))
         self.value_position = nn.Parameter(torch.zeros(candidates))
@@ -54,7 +51,7 @@ class EpipolarAttention(nn.Module):
         tokens = to_tokens(features)
         normed = self.norm1(tokens)
         queries = repeat_views(self.q_proj(normed) * self.scale, neighbours)
-        scores = self.correlate(queries, pixel_table(self.k_proj(normed)), rows)  # [pairs, candidates, h * w]
+        scores = self.products.correlate(queries, pixel_table(self.k_proj(normed)), rows)  # [pairs, candidates, h * w]
         scores = scores + queries.sum(-1)[:, None] * self.key_position[:, None] + self.score_position[:, None]
 
         known = torch.cat(
@@ -65,32 +62,8 @@ class EpipolarAttention(nn.Module):
             product = probability * prior
             probability = (product + EPSILON) / (product.sum(1, keepdim=True) + EPSILON)
 
-        gathered = self.weigh(probability, pixel_table(self.v_proj(normed)), rows)  # [pairs, h * w, channels]
+        gathered = self.products.weigh(probability, pixel_table(self.v_proj(normed)), rows)  # [pairs, h * w, channels]
         gathered = gathered + (probability * self.value_position[:, None]).sum(1)[..., None]
         tokens = tokens + self.proj(gathered.reshape(views, neighbours, -1, fixed(gathered.shape[2])).mean(1))
         tokens = tokens + self.ffn(self.norm2(tokens), height, width)
         return to_map(tokens, height, width), probability
-
-
-def pixel_table(tokens: Tensor) -> Tensor:
-    """All views' pixels as rows, and a last row of zeros for what lies outside: [views * h * w + 1, channels]."""
-    rows = tokens.flatten(0, 1)
-    return torch.cat([rows, torch.zeros_like(rows[:1])])
-
-
-def correlate(queries: Tensor, table: Tensor, rows: Tensor) -> Tensor:
-    """Inner products of queries [pairs, h * w, channels] with the table's rows: [pairs, candidates, h * w]."""
-    queries = queries[:, None]
-    starts = range(0, fixed(rows.shape[1]), CHUNK)
-    scores = [(F.embedding(rows[:, start : start + CHUNK], table) * queries).sum(-1) for start in starts]
-    return torch.cat(scores, dim=1)
-
-
-def weigh(probability: Tensor, table: Tensor, rows: Tensor) -> Tensor:
-    """The table's rows [pairs, candidates, h * w] summed by probability: [pairs, h * w, channels]."""
-    probability = probability[..., None]
-    total = torch.zeros_like(probability[:, 0])
-    for start in range(0, fixed(rows.shape[1]), CHUNK):
-        chunk = slice(start, start + CHUNK)
-        total = total + (F.embedding(rows[:, chunk], table) * probability[:, chunk]).sum(1)
-    return total

@@ -6,6 +6,7 @@ upsampled features.
 """
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,10 +23,11 @@ from idesplat.model.config import (
     UpsamplerConfig,
     ViTConfig,
 )
-from idesplat.model.cost_volume import by_all_scores, by_gathering, by_sampling
+from idesplat.model.cost_volume import by_gathering, by_sampling
 from idesplat.model.geometry import Cameras, project_candidates, sampling_points, scale_intrinsics
 from idesplat.model.layers import resize
 from idesplat.model.networks import build
+from idesplat.model.sparse_products import SparseProducts
 from idesplat.runtime.bundle import INPUTS
 from idesplat.runtime.session import open_session, run_session
 from reference_weights import draw_tensor
@@ -145,7 +147,7 @@ def test_depth_only_network_gives_the_same_depth():
         torch.testing.assert_close(alone(*inputs).depth, whole(*inputs).depth)
 
 
-@pytest.mark.parametrize("form", (by_sampling, by_all_scores, by_gathering))
+@pytest.mark.parametrize("form", (by_sampling, partial(by_gathering, products=SparseProducts(0))))
 def test_every_form_of_the_cost_volume_is_grid_sample_then_correlation(form):
     """Borders included, with cameras that turn away and candidates that fall far outside."""
     count, channels, height, width = 4, 6, 9, 13

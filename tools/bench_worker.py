@@ -22,6 +22,8 @@ MATRIX_FLOP = 2 * MATRIX_SIDE**3
 MATRIX_PRODUCTS = 3
 TIMES_PROFILED = 2
 NODE_SUFFIX = "_kernel_time"
+# Operators whose time is that of others inside them.
+LOOPS = ("Scan", "Loop", "If")
 RUN = "run"
 
 
@@ -199,6 +201,8 @@ def analyse(model: Path, provider: str, threads: int, workload: Workload) -> Pre
     operators: Counter[str] = Counter()
     stages: Counter[str] = Counter()
     for kernel in kernels:
+        if kernel["args"]["op_name"] in LOOPS:
+            continue
         operators[kernel["args"]["op_name"]] += kernel["dur"]
         scope = kernel["name"].split("/")
         stages[scope[1] if len(scope) > 2 else "other"] += kernel["dur"]

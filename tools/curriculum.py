@@ -32,14 +32,14 @@ class Phase:
     effort: float = 1.0
 
 
-# The coarse unit learns all it can at half the size in some thousand steps. Fine depth wants the full size, where a
-# pixel's disparity is twice as large: two fifths of the work happens there, in a tenth of the steps.
+# The coarse unit learns what it can at half the size in some 2500 steps. The rest is learned at the full size, where a
+# pixel's disparity is twice as large, and where splats have the size in scene units that they will be used with.
 GRADUAL = (
-    Phase(0.65, units=1, gaussians=False, shrink=2),
-    Phase(0.72, units=2, gaussians=False, shrink=2, effort=2.0),
-    Phase(0.85, units=3, gaussians=False, shrink=2, effort=3.0),
-    Phase(0.92, units=3, gaussians=True, shrink=2, effort=4.0),
-    Phase(1.00, units=3, gaussians=True, shrink=1, effort=14.0),
+    Phase(0.57, units=1, gaussians=False, shrink=2),
+    Phase(0.64, units=2, gaussians=False, shrink=2, effort=2.0),
+    Phase(0.74, units=3, gaussians=False, shrink=2, effort=3.0),
+    Phase(0.87, units=3, gaussians=False, shrink=1, effort=11.0),
+    Phase(1.00, units=3, gaussians=True, shrink=1, effort=15.0),
 )
 
 

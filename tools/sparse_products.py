@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..model.epipolar_attention import EpipolarAttention
 from ..model.idesplat import IDESplat
+from ..model.sparse_products import SparseProducts
 
 _compiled = functools.partial(
     numba.njit, cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp", "nsz", "reassoc"}
@@ -18,9 +18,9 @@ _compiled = functools.partial(
 
 def with_compiled_products(model: IDESplat) -> IDESplat:
     """The same network, whose epipolar layers multiply here: the same sums, ten times as fast."""
-    for layer in model.modules():
-        if isinstance(layer, EpipolarAttention):
-            layer.correlate, layer.weigh = correlate, weigh
+    for products in model.modules():
+        if isinstance(products, SparseProducts):
+            products.correlate, products.weigh = correlate, weigh
     return model
 
 
@@ -63,12 +63,12 @@ class _Weigh(torch.autograd.Function):
 
 
 def correlate(queries: Tensor, table: Tensor, rows: Tensor) -> Tensor:
-    """As `model.epipolar_attention.correlate`."""
+    """As `model.sparse_products.correlate`."""
     return _Correlate.apply(queries, table, rows)
 
 
 def weigh(probability: Tensor, table: Tensor, rows: Tensor) -> Tensor:
-    """As `model.epipolar_attention.weigh`."""
+    """As `model.sparse_products.weigh`."""
     return _Weigh.apply(probability, table, rows)
 
 

@@ -1,0 +1,131 @@
+"""The sparse products of epipolar attention as ONNX runs them fastest: a few pixels at a time, by a Scan.
+
+A pixel's candidates fall on some hundred rows of features. Gathered for all pixels at once they fill gigabytes, which
+go through memory three times. Gathered for a few pixels they stay in a processor's cache, where a product of matrices
+uses them up; a Scan does so in one node, whatever the size of the images.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import onnx.inliner
+import onnx.parser
+import torch
+from torch import Tensor, nn
+
+from ..model.sparse_products import SparseProducts, correlate, weigh
+
+# With fewer numbers than this to gather for a pixel, the steps cost more than they save.
+FEW = 256
+# While a network is traced each product is one node of this domain; these functions say what it does.
+DOMAIN = "idesplat"
+HEADER = f'<domain: "{DOMAIN}", opset_import: ["": 20]>'
+# A step takes 16 pixels. Every map has a multiple of them, since its sides are multiples of 4; more leave the cache.
+FUNCTIONS = (
+    # queries [pairs, h * w, channels], table [rows, channels], rows [pairs, candidates, h * w]
+    # -> scores [pairs, candidates, h * w]
+    """correlate (queries, table, rows) => (scores) {
+        candidates = Shape <start = 1, end = 2> (rows)
+        pixels = Shape <start = 2, end = 3> (rows)
+        channels = Shape <start = 1, end = 2> (table)
+        all = Constant <value_ints = [-1]> ()
+        step = Constant <value_ints = [-1, 16]> ()
+        one = Constant <value_ints = [1]> ()
+        rows_shape = Concat <axis = 0> (step, candidates)
+        rows_by_pixel = Transpose <perm = [0, 2, 1]> (rows)
+        rows_by_step = Reshape (rows_by_pixel, rows_shape)
+        queries_shape = Concat <axis = 0> (step, channels, one)
+        queries_by_step = Reshape (queries, queries_shape)
+        scores_by_step = Scan <num_scan_inputs = 2, body = some (
+            int32[p, n] some_rows, float[p, c, u] some_queries
+        ) => (float[p, n, u] some_scores) {
+            gathered = Gather (table, some_rows)
+            some_scores = MatMul (gathered, some_queries)
+        }> (rows_by_step, queries_by_step)
+        scores_shape = Concat <axis = 0> (all, pixels, candidates)
+        scores_by_pixel = Reshape (scores_by_step, scores_shape)
+        scores = Transpose <perm = [0, 2, 1]> (scores_by_pixel)
+    }""",
+    # probability and rows [pairs, candidates, h * w], table [rows, channels] -> sums [pairs, h * w, channels]
+    """weigh (probability, table, rows) => (sums) {
+        candidates = Shape <start = 1, end = 2> (rows)
+        pixels = Shape <start = 2, end = 3> (rows)
+        channels = Shape <start = 1, end = 2> (table)
+        all = Constant <value_ints = [-1]> ()
+        step = Constant <value_ints = [-1, 16]> ()
+        one = Constant <value_ints = [1]> ()
+        rows_shape = Concat <axis = 0> (step, candidates)
+        rows_by_pixel = Transpose <perm = [0, 2, 1]> (rows)
+        rows_by_step = Reshape (rows_by_pixel, rows_shape)
+        weights_shape = Concat <axis = 0> (step, one, candidates)
+        weights_by_pixel = Transpose <perm = [0, 2, 1]> (probability)
+        weights_by_step = Reshape (weights_by_pixel, weights_shape)
+        sums_by_step = Scan <num_scan_inputs = 2, body = some (
+            int32[p, n] some_rows, float[p, u, n] some_weights
+        ) => (float[p, u, c] some_sums) {
+            gathered = Gather (table, some_rows)
+            some_sums = MatMul (some_weights, gathered)
+        }> (rows_by_step, weights_by_step)
+        sums_shape = Concat <axis = 0> (all, pixels, channels)
+        sums = Reshape (sums_by_step, sums_shape)
+    }""",
+)
+
+
+@contextmanager
+def in_steps(network: nn.Module) -> Iterator[None]:
+    """Have a network's sparse products traced as nodes that `explain` explains."""
+    parts = [part for part in network.modules() if isinstance(part, SparseProducts) and part.gathers >= FEW]
+    for part in parts:
+        part.correlate, part.weigh = _Correlate.apply, _Weigh.apply
+    try:
+        yield
+    finally:
+        for part in parts:
+            part.correlate, part.weigh = correlate, weigh
+
+
+def explain(traced: onnx.ModelProto) -> onnx.ModelProto:
+    """The graph with standard operators in place of the nodes that `in_steps` left, and named after them."""
+    products = {node.output[0]: node.name for node in traced.graph.node if node.domain == DOMAIN}
+    traced.functions.extend(onnx.parser.parse_function(HEADER + function) for function in FUNCTIONS)
+    model = onnx.inliner.inline_local_functions(traced)
+    name = ""
+    for node in reversed(model.graph.node):  # a product's result is the last of its nodes
+        name = products.get(node.output[0], name)
+        if not node.name:
+            _name(node, name)
+    return model
+
+
+def _name(node: onnx.NodeProto, scope: str) -> None:
+    """Name a node, and what is inside it."""
+    node.name = f"{scope}/{node.output[0]}"
+    for attribute in node.attribute:
+        for inner in attribute.g.node:
+            _name(inner, node.name)
+
+
+class _Correlate(torch.autograd.Function):
+    """`correlate`, traced as one node."""
+
+    @staticmethod
+    def forward(ctx: Any, queries: Tensor, table: Tensor, rows: Tensor) -> Tensor:
+        return correlate(queries, table, rows)
+
+    @staticmethod
+    def symbolic(g: Any, queries: Any, table: Any, rows: Any) -> Any:
+        return g.op(f"{DOMAIN}::correlate", queries, table, rows).setType(queries.type().with_sizes([None] * 3))
+
+
+class _Weigh(torch.autograd.Function):
+    """`weigh`, traced as one node."""
+
+    @staticmethod
+    def forward(ctx: Any, probability: Tensor, table: Tensor, rows: Tensor) -> Tensor:
+        return weigh(probability, table, rows)
+
+    @staticmethod
+    def symbolic(g: Any, probability: Any, table: Any, rows: Any) -> Any:
+        return g.op(f"{DOMAIN}::weigh", probability, table, rows).setType(table.type().with_sizes([None] * 3))
