@@ -1,8 +1,9 @@
-"""The sparse products of epipolar attention as ONNX runs them fastest: a few pixels at a time, by a Scan.
+"""The sparse products of epipolar attention as ONNX runs them fastest: a few pixels at a time, by a Loop.
 
 A pixel's candidates fall on some hundred rows of features. Gathered for all pixels at once they fill gigabytes, which
 go through memory three times. Gathered for a few pixels they stay in a processor's cache, where a product of matrices
-uses them up; a Scan does so in one node, whatever the size of the images.
+uses them up; a Loop does so in one node, whatever the size of the images. (A Scan is as fast, but OpenVINO refuses one
+whose steps read a tensor from around it, as the table is.)
 """
 
 from collections.abc import Iterator
@@ -37,12 +38,16 @@ FUNCTIONS = (
         rows_by_step = Reshape (rows_by_pixel, rows_shape)
         queries_shape = Concat <axis = 0> (step, channels, one)
         queries_by_step = Reshape (queries, queries_shape)
-        scores_by_step = Scan <num_scan_inputs = 2, body = some (
-            int32[p, n] some_rows, float[p, c, u] some_queries
-        ) => (float[p, n, u] some_scores) {
+        steps_shape = Shape <start = 0, end = 1> (rows_by_step)
+        steps = Squeeze (steps_shape)
+        go = Constant <value = bool {1}> ()
+        scores_by_step = Loop <body = some (int64 i, bool going) => (bool go_on, float[p, n, u] some_scores) {
+            go_on = Identity (going)
+            some_rows = Gather (rows_by_step, i)
+            some_queries = Gather (queries_by_step, i)
             gathered = Gather (table, some_rows)
             some_scores = MatMul (gathered, some_queries)
-        }> (rows_by_step, queries_by_step)
+        }> (steps, go)
         scores_shape = Concat <axis = 0> (all, pixels, candidates)
         scores_by_pixel = Reshape (scores_by_step, scores_shape)
         scores = Transpose <perm = [0, 2, 1]> (scores_by_pixel)
@@ -61,12 +66,16 @@ FUNCTIONS = (
         weights_shape = Concat <axis = 0> (step, one, candidates)
         weights_by_pixel = Transpose <perm = [0, 2, 1]> (probability)
         weights_by_step = Reshape (weights_by_pixel, weights_shape)
-        sums_by_step = Scan <num_scan_inputs = 2, body = some (
-            int32[p, n] some_rows, float[p, u, n] some_weights
-        ) => (float[p, u, c] some_sums) {
+        steps_shape = Shape <start = 0, end = 1> (rows_by_step)
+        steps = Squeeze (steps_shape)
+        go = Constant <value = bool {1}> ()
+        sums_by_step = Loop <body = some (int64 i, bool going) => (bool go_on, float[p, u, c] some_sums) {
+            go_on = Identity (going)
+            some_rows = Gather (rows_by_step, i)
+            some_weights = Gather (weights_by_step, i)
             gathered = Gather (table, some_rows)
             some_sums = MatMul (some_weights, gathered)
-        }> (rows_by_step, weights_by_step)
+        }> (steps, go)
         sums_shape = Concat <axis = 0> (all, pixels, channels)
         sums = Reshape (sums_by_step, sums_shape)
     }""",

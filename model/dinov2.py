@@ -78,15 +78,15 @@ class DinoV2(nn.Module):
     def _position_embedding(self, rows: int, columns: int) -> Tensor:
         """The trained square of position embeddings, interpolated bicubically: [1, 1 + rows * columns, dim]."""
         grid = self.config.grid
-        square = self.pos_embed[0, 1:].reshape(grid, grid, -1).permute(2, 0, 1)  # [dim, grid, grid]
+        square = self.pos_embed[0, 1:].reshape(grid, -1)  # [grid, grid * dim]: two dimensions, which OpenVINO needs
         # At the trained size the embedding is taken as it is: without the offset the weights are the identity.
         ones = square.new_ones
         trained = ((ones(rows).sum() == grid) & (ones(columns).sum() == grid)).to(square.dtype)
         offset = INTERPOLATION_OFFSET * (1 - trained)
         vertical = _cubic_weights(rows, grid, offset, square)
         horizontal = _cubic_weights(columns, grid, offset, square)
-        resized = vertical @ square @ horizontal.transpose(0, 1)  # [dim, rows, columns]
-        return torch.cat([self.pos_embed[:, :1], resized.flatten(1).transpose(0, 1)[None]], dim=1)
+        resized = horizontal @ (vertical @ square).unflatten(1, (grid, -1))  # [rows, columns, dim]
+        return torch.cat([self.pos_embed[:, :1], resized.flatten(0, 1)[None]], dim=1)
 
 
 def _cubic_weights(out_size: int, in_size: int, offset: Tensor, like: Tensor) -> Tensor:

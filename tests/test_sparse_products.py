@@ -60,12 +60,12 @@ def test_exported_values_are_the_networks_own(tmp_path) -> None:
 
     model = exported(FEW, drawn(2, 32), str(tmp_path / "both.onnx"))
     onnx.checker.check_model(model, full_check=True)
-    assert [node.op_type for node in model.graph.node].count("Scan") == 2
+    assert [node.op_type for node in model.graph.node].count("Loop") == 2
     assert {node.domain for node in model.graph.node} == {""}
     names = [node.name for node in model.graph.node]
     assert all(names) and len(set(names)) == len(names)
-    scans = [node for node in model.graph.node if node.op_type == "Scan"]
-    assert all("table" in names_read(node) and "table" not in node.input for node in scans)
+    loops = [node for node in model.graph.node if node.op_type == "Loop"]
+    assert all("table" in names_read(node) and "table" not in node.input for node in loops)
     session = onnxruntime.InferenceSession(model.SerializeToString())
     for pairs, pixels in ((2, 32), (3, 80)):  # another number of both
         arguments = drawn(pairs, pixels)
@@ -76,4 +76,4 @@ def test_exported_values_are_the_networks_own(tmp_path) -> None:
 def test_few_numbers_are_gathered_at_once(tmp_path) -> None:
     arguments = torch.ones(1, 16, CHANNELS), torch.ones(16, CHANNELS), torch.zeros(1, 2, 16, dtype=torch.int32)
     model = exported(FEW - 1, arguments, str(tmp_path / "both.onnx"))
-    assert not [node for node in model.graph.node if node.op_type == "Scan"]
+    assert not [node for node in model.graph.node if node.op_type == "Loop"]
