@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import onnxruntime
 
+from . import openvino
 from .errors import InputError
 from .graph_cache import place_for
 
@@ -18,8 +19,12 @@ SUFFIX = "ExecutionProvider"
 
 def provider_name(provider: str) -> str:
     """`cuda`, `CUDA` or `CUDAExecutionProvider` -> the last; raises InputError naming what is installed."""
-    available = onnxruntime.get_available_providers()
     wanted = provider.removesuffix(SUFFIX).lower()
+    if wanted == openvino.PROVIDER.removesuffix(SUFFIX).lower():
+        if not openvino.installed():
+            raise InputError("execution provider OpenVINO is not installed; pip install 'idesplat[openvino]'")
+        return openvino.PROVIDER
+    available = onnxruntime.get_available_providers()
     for name in available:
         if name.removesuffix(SUFFIX).lower() == wanted:
             return name
@@ -46,9 +51,12 @@ def open_session(model: Path | bytes, provider: str = CPU, tuning: Tuning = USUA
     """Load a graph on one execution provider, given by its full name, as `provider_name` gives it.
 
     On the CPU a file's optimised graph is kept for the next time (see `graph_cache`).
-    Raises InputError if the file cannot be loaded, or if ONNX Runtime silently fell back to another provider.
+    Raises InputError if the file cannot be loaded, if ONNX Runtime silently fell back to another provider, or if
+    OpenVINO has no processor to run on.
     """
     options = _options(tuning)
+    if provider == openvino.PROVIDER:
+        openvino.add_openvino(options)
     if provider == CPU and isinstance(model, Path) and tuning.optimise:
         cached = _open_cached(model, options)
         if cached is not None:
@@ -97,7 +105,8 @@ def _create(
     model: Path | bytes, options: onnxruntime.SessionOptions, provider: str = CPU
 ) -> onnxruntime.InferenceSession:
     source = model if isinstance(model, bytes) else str(model)
-    return onnxruntime.InferenceSession(source, options, providers=[provider])
+    providers = None if provider == openvino.PROVIDER else [provider]  # a plug-in is named in the options
+    return onnxruntime.InferenceSession(source, options, providers=providers)
 
 
 def _open_cached(model: Path, options: onnxruntime.SessionOptions) -> onnxruntime.InferenceSession | None:
