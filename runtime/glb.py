@@ -61,7 +61,7 @@ def write_glb(path: Path, gaussians: Gaussians) -> list[str]:
         PREFIX + "OPACITY": turned.opacities,
     }
     names = _coefficients(turned.sh_degree)
-    attributes |= {name: np.ascontiguousarray(turned.sh[:, index]) for index, name in enumerate(names)}
+    attributes |= {name: turned.sh[:, index] for index, name in enumerate(names)}
     document = json.dumps(_document(attributes), separators=(",", ":")).encode()
     document += b" " * (-len(document) % 4)
     size = sum(values.nbytes for values in attributes.values())
@@ -69,7 +69,7 @@ def write_glb(path: Path, gaussians: Gaussians) -> list[str]:
         file.write(HEADER.pack(MAGIC, VERSION, HEADER.size + 2 * CHUNK.size + len(document) + size))
         file.write(CHUNK.pack(len(document), JSON) + document + CHUNK.pack(size, BINARY))
         for values in attributes.values():
-            file.write(values.data)
+            file.write(np.ascontiguousarray(values).data)
     return []
 
 

@@ -35,7 +35,7 @@ def write_splat(path: Path, gaussians: Gaussians) -> list[str]:
     records["quat"] = nearest_bytes(unit_quaternions(gaussians.quats) * ONE + ZERO)
     with replacing(path) as temporary:
         temporary.write_bytes(records.tobytes())
-    lost = [f"spherical harmonics of degree 1 to {gaussians.sh_degree} left out"] if gaussians.sh_degree else []
+    lost = ["spherical harmonics above degree 0 left out"] if gaussians.sh_degree else []
     return lost + moved("colours", gaussians.colours, 0, 1)
 
 

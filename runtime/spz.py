@@ -103,7 +103,7 @@ def _fractional_bits(path: Path, means: np.ndarray) -> int:
 
 def _pack_positions(means: np.ndarray, bits: int) -> np.ndarray:
     """Fixed-point numbers in three bytes, the lowest first."""
-    fixed = np.rint(means.astype(np.float64) * 2**bits).astype("<i4")
+    fixed = np.rint(means.astype(np.float64) * 2**bits).astype("<i4", order="C")
     return fixed.view(np.uint8).reshape(-1, 3, 4)[..., :3]
 
 

@@ -58,6 +58,16 @@ def test_what_we_write_comes_back(tmp_path: Path, truth: Gaussians, suffix: str,
     assert_close(back, truth, our_bounds(suffix, truth), in_order=suffix not in SORTED)
 
 
+@pytest.mark.parametrize("source", FORMATS)
+def test_each_format_takes_what_each_reader_gives(tmp_path: Path, truth: Gaussians, source: str) -> None:
+    write_scene(tmp_path / f"source{source}", truth)
+    scene = read_scene(tmp_path / f"source{source}")
+    for suffix in FORMATS:
+        write_scene(tmp_path / f"scene{suffix}", scene)
+        back = read_scene(tmp_path / f"scene{suffix}")
+        assert_close(back, without_bands(scene, back.sh_degree), our_bounds(suffix, scene), suffix not in SORTED)
+
+
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_the_third_degree_and_no_gaussians(tmp_path: Path, truth: Gaussians, suffix: str) -> None:
     rng = np.random.default_rng(0)
@@ -238,7 +248,7 @@ def test_what_a_format_cannot_hold_is_said(tmp_path: Path, truth: Gaussians) -> 
     scene.sh[7, 0] = 2 / SH_0
     notes = {suffix: " ".join(write_scene(tmp_path / f"scene{suffix}", scene)) for suffix in FORMATS}
     assert notes[".ply"] == ""
-    assert "degree 1 to 1 left out" in notes[".splat"] and "3 of 810 colours outside 0 to 1" in notes[".splat"]
+    assert "above degree 0 left out" in notes[".splat"] and "3 of 810 colours outside 0 to 1" in notes[".splat"]
     for text in ("1 of 810 scales outside 4.54e-05", "1 of 2,430 spherical harmonics", "3 of 810 colours"):
         assert text in notes[".spz"]
     assert "1 of 810 scales" in notes[".compressed.ply"] and "1 of 2,430 spherical" in notes[".compressed.ply"]
@@ -294,7 +304,7 @@ def test_the_command_goes_all_the_way_round(
     )
     assert_close(read_ply(Path("d.ply")), truth, total, in_order=False)
     assert run_command(convert, "d.ply", "e.splat") == 0
-    assert "note: spherical harmonics of degree 1 to 2 left out" in capsys.readouterr().out
+    assert "note: spherical harmonics above degree 0 left out" in capsys.readouterr().out
 
 
 def test_the_command_leaves_out_what_is_faint(
