@@ -11,41 +11,29 @@ import numpy as np
 
 from .cameras import located, rigid
 from .errors import InputError
+from .files import read_bytes
 
-LARGEST_TEXT = 512 * 2**20  # bytes
-
-
-def read_bytes(path: Path) -> bytes:
-    """The whole file; raises InputError if it cannot be read, is empty, or is too large to hold cameras."""
-    try:
-        size = path.stat().st_size
-        if size > LARGEST_TEXT:
-            raise InputError(f"has {size >> 20} MiB, expected a file of cameras")
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror}); expected a file of cameras") from None
-    if not content:
-        raise InputError("is empty, expected a file of cameras")
-    return content
+EXPECTED = "a file of cameras"
+LARGEST = 512 * 2**20  # bytes
 
 
 def read_text(path: Path) -> str:
     """The whole file as text; raises InputError."""
     try:
-        return read_bytes(path).decode("utf-8-sig")
+        return read_bytes(path, EXPECTED, LARGEST).decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise InputError("is not text, expected a file of cameras") from None
+        raise InputError(f"is not text, expected {EXPECTED}") from None
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """The JSON object in a file; raises InputError."""
-    content = read_bytes(path)
+    content = read_bytes(path, EXPECTED, LARGEST)
     try:
         document = json.loads(content)
     except RecursionError:
         raise InputError("is not a file of cameras: JSON nested too deeply") from None
     except ValueError as error:  # not JSON, not UTF-8, or a number with thousands of digits
-        raise InputError(f"is not valid JSON ({error}); expected a file of cameras") from None
+        raise InputError(f"is not valid JSON ({error}); expected {EXPECTED}") from None
     if not isinstance(document, dict):
         raise InputError(f"holds {shown(document)}, expected a JSON object with cameras")
     return document

@@ -66,11 +66,15 @@ class Camera:
 
 @contextmanager
 def located(where: str) -> Iterator[None]:
-    """Put `where` (a file, a frame, a field) in front of the message of an InputError raised inside the block."""
+    """Put `where` (a file, a frame, a field) in front of the message of an InputError raised inside the block.
+
+    Once only: what reads a whole file says which one itself.
+    """
     try:
         yield
     except InputError as error:
-        raise InputError(f"{where}: {error}") from None
+        message = str(error)
+        raise InputError(message if message.startswith(f"{where}: ") else f"{where}: {message}") from None
 
 
 def read_cameras(path: Path, pictures: Sequence[Path] = (), form: CameraFormat | None = None) -> list[Camera]:

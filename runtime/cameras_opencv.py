@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from .camera_fields import read_bytes
+from .camera_fields import EXPECTED, LARGEST
 from .cameras import Camera, invert_rigid, located
 from .errors import InputError
+from .files import read_bytes
 
 # What the fields are called, in OpenCV's documentation, samples and forums.
 MATRIX = ("M{}", "K{}", "cameraMatrix{}", "camera_matrix_{}", "camera_matrix{}", "CM{}")
@@ -63,7 +64,7 @@ def _fields(path: Path) -> dict[str, Any]:
     """The fields of the file's top level: numbers, text and matrices (float64)."""
     import cv2
 
-    text = read_bytes(path).decode("utf-8", errors="replace")
+    text = read_bytes(path, EXPECTED, LARGEST).decode("utf-8", errors="replace")
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         root = storage.root()

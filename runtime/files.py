@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from .errors import InputError
+from .errors import InputError, refuse
 
 # Compression reaches ratios of 1000, but no scene comes near these: what claims more would only fill the memory.
 MOST_EXPANSION = 64
@@ -38,12 +38,22 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def read_bytes(path: Path, expected: str) -> bytes:
-    """The content of a file; raises InputError, naming what was expected, where it cannot be read."""
+def read_bytes(path: Path, expected: str, largest: int | None = None) -> bytes:
+    """The content of a file; raises InputError, naming what was expected, if it cannot be read, or is empty.
+
+    largest: bytes from which on it cannot be what was expected, either.
+    """
+    path = Path(path)
     try:
-        return Path(path).read_bytes()
+        size = path.stat().st_size
+        if largest is not None and size > largest:
+            refuse(path, f"has {size >> 20} MiB", f"expected {expected}")
+        content = path.read_bytes()
     except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}; expected {expected}") from None
+        refuse(path, f"cannot be read ({error.strerror})", f"expected {expected}")
+    if not content:
+        refuse(path, "is empty", f"expected {expected}")
+    return content
 
 
 def check_expansion(path: Path, unpacked: int, packed: int) -> None:

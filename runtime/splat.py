@@ -42,7 +42,7 @@ def write_splat(path: Path, gaussians: Gaussians) -> list[str]:
 def read_splat(path: Path) -> Gaussians:
     """Read a .splat; raises InputError if the file cannot be read, is not one, or holds a value that is none."""
     content = read_bytes(path, "a splat file (.splat)")
-    if len(content) % RECORD.itemsize or not content:
+    if len(content) % RECORD.itemsize:
         refuse(path, f"{len(content)} bytes long", "a .splat has 32 bytes for each Gaussian; copy or download it again")
     records = np.frombuffer(content, RECORD)
     if (records["scale"] < 0).any():

@@ -290,6 +290,9 @@ def test_files_that_cannot_be_read(tmp_path):
         read_cameras(tmp_path)
     with pytest.raises(InputError, match="cannot be read"):
         read_cameras(tmp_path, form=CameraFormat.OWN)
+    with pytest.raises(InputError, match="cannot be read") as refused:  # without looking into it first
+        read_cameras(tmp_path / "nowhere.json", form=CameraFormat.OWN)
+    assert str(refused.value).count("nowhere.json") == 1
 
 
 @pytest.mark.parametrize("bad", [[1, 2, 3], "no", [1, 2, 3, None], {"k1": 1}, [1] * 6])
