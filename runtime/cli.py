@@ -1,6 +1,7 @@
 """The command idesplat-infer: photographs and cameras to a splat file, depth maps and views."""
 
 import json
+import shlex
 import time
 from collections import Counter
 from dataclasses import asdict, replace
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
     from .cleaning import Cleaning
     from .depth_range import DepthRange
-    from .inputs import Inputs
+    from .inputs import Inputs, Request
     from .runner import Prediction, Runner
     from .views import Views
 
@@ -125,22 +126,27 @@ def infer(
     with working("loading the model"):
         runner = Runner(model or default_model(), provider)
     _check_fit(runner, out, cleaning, {"--render": render, "--report": report})
+    preparing = time.perf_counter()
     inputs = read_inputs(given, runner)
     prepared = inputs.views
     span = runner.depth_range(prepared, near, far)
+    predicting = time.perf_counter()
     prediction = _predict(prepared, runner, span)
+    writing = time.perf_counter()
     cleaned: dict[str, int] = {}
     if cleaning.asked and not is_surface(out):
         prediction, cleaned = _clean(prediction, prepared, cleaning)
     _write_scene(prediction, prepared, out, cleaning)
     if prediction.gaussians is None and save_depth is None:  # depth maps are what such a model is for
         save_depth = make_folder(out.with_name(out.name.partition(".")[0] + DEPTH_FOLDER))
-    written = [out, *_write_pictures(prediction, prepared, save_depth, render)]
+    pictures = _write_pictures(prediction, prepared, save_depth, render)
+    written = [out]
     if save_cameras is not None:
         write_cameras(save_cameras, inputs.cameras)
         written.append(save_cameras)
-    seconds = {"load": runner.load_seconds, **prediction.seconds, "total": time.perf_counter() - started}
-    summary = _summary(prediction, inputs, cameras, runner, span, seconds, written)
+    seconds = {"load": runner.load_seconds, "prepare": predicting - preparing, **prediction.seconds}
+    seconds |= {"write": time.perf_counter() - writing, "total": time.perf_counter() - started}
+    summary = _summary(prediction, inputs, cameras, runner, span, seconds, [*written, *pictures])
     summary["cleaned"] = {"asked": asdict(cleaning), "left_out": cleaned}
     if report is not None:
         from .inference_report import write_report
@@ -157,8 +163,9 @@ def infer(
     print(f"near {span.near:.4g} and far {span.far:.4g}, in the cameras' unit: {span.source}")
     for path in written:
         print(f"wrote {path}")
+    _say_pictures(len(prepared.names), save_depth, render)
     if prediction.gaussians is not None and holds_splats(out):
-        _say_how_to_draw(out, _cameras_for_drawing(cameras, save_cameras))
+        _say_how_to_look(out, given, save_cameras)
     else:
         print(f"open {out} in MeshLab, CloudCompare or Blender")
     if report is not None:
@@ -172,17 +179,27 @@ def main() -> None:
     typer.run(infer)
 
 
-def _cameras_for_drawing(cameras: str, save_cameras: Path | None) -> str:
-    """What to give as cameras to look at the result."""
-    if cameras != ESTIMATE:
-        return cameras
-    return str(save_cameras or "CAMERAS.json (which --save-cameras writes)")
+def _say_pictures(views: int, save_depth: Path | None, render: Path | None) -> None:
+    if save_depth is not None:
+        print(f"wrote {save_depth}: {views} depth maps, as .png to look at and as .npz in the cameras' unit")
+    if render is not None:
+        print(f"wrote {render}: {views} views and {PATH_FRAMES} frames of a path through them, as .png")
 
 
-def _say_how_to_draw(out: Path, cameras: str) -> None:
+def _say_how_to_look(out: Path, given: "Request", save_cameras: Path | None) -> None:
+    """Commands to copy. Cameras that were found are of use only where they were kept."""
+    cameras: list[str] = []
+    if given.cameras != ESTIMATE:
+        form = ["--camera-format", given.camera_format] if given.camera_format else []
+        cameras = ["--cameras", given.cameras, *form]
+    elif save_cameras is not None:
+        cameras = ["--cameras", str(save_cameras)]
+    photographs = ["--images", str(given.images[0])] if cameras and len(given.images) == 1 else []
     print(f"open {out} in any splat viewer (SuperSplat, for one), look at it in the browser, or draw it:")
-    print(f"    idesplat-view {out} --cameras {cameras}")
-    print(f"    idesplat-render {out} --cameras {cameras} --out DIR")
+    print("    " + shlex.join(["idesplat-view", str(out), *cameras, *photographs]))
+    print("    " + shlex.join(["idesplat-render", str(out), *cameras, "--out"]) + " DIR")
+    if not cameras:
+        print("    (--save-cameras FILE.json keeps the cameras that were found, to be given here as --cameras)")
 
 
 def _check_outputs(out: Path, files: "Sequence[Path | None]", folders: "Sequence[Path | None]") -> None:

@@ -10,13 +10,14 @@ from .camera_format import ESTIMATE, CameraFormat
 from .cameras import Camera, read_cameras, recognise
 from .cameras_re10k import timestamps
 from .errors import InputError
-from .images import find_images, stem
+from .images import cover, find_images, stem
 from .runner import Runner
-from .sizes import parse_size
+from .sizes import nearest_size, parse_size
 from .view_choice import FEWEST_VIEWS
 from .views import Views, match, prepare
 
 DEFAULT_VIEWS = 2
+MUCH = 0.7  # share of a photograph below which it is said that the rest is cut off
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,9 @@ def read_inputs(request: Request, runner: Runner) -> Inputs:
         count = min(_wanted(request, runner) or len(pairs), len(pairs))
         runner.check_size(max(count, FEWEST_VIEWS), height, width)
         views = prepare(pairs, count, height, width)
+    if request.views and request.views > len(pairs):
+        notes.append(f"--views {request.views}: all {len(pairs)} photographs used; there are no more with a camera")
+    notes += _cut(views.cameras[0], height, width, runner)
     if views.choice:
         notes.append(
             f"{count} of {len(pairs)} photographs used: {', '.join(views.names)}; {views.choice} "
@@ -127,6 +131,18 @@ def _wanted(request: Request, runner: Runner) -> int | None:
     if fixed:
         return fixed
     return request.views or (None if request.frames else DEFAULT_VIEWS)
+
+
+def _cut(camera: Camera, height: int, width: int, runner: Runner) -> list[str]:
+    """A line that tells of the part of the photographs that is cut off, where that is much, and of a size without."""
+    crop = cover(camera.width, camera.height, width, height)
+    share = width * height / (crop.width * crop.height)
+    if share >= MUCH:
+        return []
+    own = runner.description
+    whole = nearest_size(camera.height / camera.width, own.height * own.width, own.size_multiple)
+    remedy = "" if own.fixed_size else f"; --size {whole[0]}x{whole[1]} takes in nearly all"
+    return [f"the middle {height}x{width} of each photograph is used, {100 * share:.0f} % of it{remedy}"]
 
 
 def _estimated(photographs: int, cameras: Sequence[Camera]) -> str:

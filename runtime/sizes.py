@@ -16,6 +16,12 @@ def size_fits(height: int, width: int, multiple: int) -> bool:
     return height % multiple == width % multiple == 0 and min(height, width) >= 2 * multiple
 
 
+def nearest_size(aspect: float, area: float, multiple: int) -> tuple[int, int]:
+    """Height and width in steps of `multiple`, with a quotient near `aspect` and a product near `area` in pixels."""
+    height, width = (multiple * max(2, round((area * side) ** 0.5 / multiple)) for side in (aspect, 1 / aspect))
+    return height, width
+
+
 def size_rule(multiple: int) -> str:
     """What `size_fits` asks, in words."""
     return f"height and width must be multiples of {multiple} from {2 * multiple}"

@@ -1,6 +1,7 @@
 """The command idesplat-infer, as a user meets it: results, and one line for everything that is wrong."""
 
 import json
+import shlex
 import shutil
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from idesplat.runtime.cli import main
 from idesplat.runtime.formats import read_scene
 from idesplat.runtime.ply import read_ply
 from idesplat.runtime.render import main as render_main
+from idesplat.runtime.view import main as view_main
 from idesplat.tools.make_scene import make_scene
 
 
@@ -61,9 +63,38 @@ def test_everything_it_can_write(workplace, scene, capsys):
         "3 of 5 photographs",
         "idesplat-view scene.ply",
         "idesplat-render scene.ply",
+        "wrote depth: 3 depth maps",
+        "wrote views: 3 views and 24 frames",
         "total",
     ):
         assert text in printed
+    assert "path-0" not in printed  # not line by line
+    assert len(summary["files"]) == 1 + 6 + 27
+    assert list(summary["seconds"]) == ["load", "prepare", "model", "write", "total"]
+
+
+def test_commands_to_copy_work_in_folders_with_spaces(workplace, capsys):
+    Path("images").rename("my photographs")
+    Path("transforms.json").rename("my cameras")
+    given = ("--images", "my photographs", "--cameras", "my cameras", "--camera-format", "transforms")
+    assert run_command(main, *given, "--model", "model.onnx", "--out", "my scene.ply") == 0
+    printed = capsys.readouterr().out
+    view, render = (shlex.split(line) for line in printed.splitlines() if line.startswith("    "))
+    cameras = ["--cameras", "my cameras", "--camera-format", "transforms"]
+    assert view == ["idesplat-view", "my scene.ply", *cameras, "--images", "my photographs"]
+    assert render == ["idesplat-render", "my scene.ply", *cameras, "--out", "DIR"]
+    assert run_command(render_main, *render[1:]) == 0
+    assert run_command(view_main, *view[1:], "--html", "page.html") == 0
+
+
+def test_what_is_not_used_is_said(workplace, capsys):
+    assert run_command(main, *USUAL, "--views", "9") == 0
+    printed = capsys.readouterr().out
+    assert "--views 9: all 5 photographs used" in printed
+    assert "of each photograph is used" not in printed  # nearly all is
+    assert run_command(main, *USUAL, "--size", "128x64", "--frames", "0,1") == 0
+    # of 128 x 96 pixels, at a trained size of 96 x 64
+    assert "the middle 128x64 of each photograph is used, 37 % of it; --size " in capsys.readouterr().out
 
 
 def test_staged_folder_and_a_list_of_files(workplace, exported):
@@ -145,6 +176,9 @@ def test_photographs_alone(workplace, tmp_path_factory, capsys):
     assert "what the cameras are known to see" in printed and "--cameras found.json" in printed
     assert len(read_ply(Path("scene.ply"))) == 2 * 64 * 96
     assert run_command(render_main, "scene.ply", "--cameras", "found.json", "--out", "drawn") == 0
+    assert run_command(main, *given, "--focal", focal) == 0
+    printed = capsys.readouterr().out
+    assert "--save-cameras FILE.json" in printed and "idesplat-view scene.ply\n" in printed
     Path("scene.ply").unlink()
     assert run_command(main, *given) == 2  # no focal length
     assert not Path("scene.ply").exists()
