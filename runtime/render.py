@@ -25,6 +25,7 @@ VIDEO, PICTURE = ".mp4", ".png"
 COLOUR, DEPTH, ALPHA = "", "-depth", "-alpha"  # what a picture shows, as its name ends
 SOLID = 0.5  # alpha from which on a pixel has a depth
 SIZE = "360x640"  # where neither cameras nor --size say so
+MOST_LISTED = 12  # files that are named one by one
 
 
 @exit_on_input_error
@@ -60,6 +61,7 @@ def render(
         raise InputError(f"--background is {background}, expected red, green and blue from 0 to 1")
     if not 0 < fps <= 1000:
         raise InputError(f"--fps {fps:g}: expected frames a second, 1 to 1000")
+    _check_out(out)
     if path and orbit:
         raise InputError("--path and --orbit: expected one of them")
     views = read_cameras(cameras, form=camera_format) if cameras else []
@@ -74,14 +76,24 @@ def render(
         written = _film(draw, shots, out, fps, kinds)
     else:
         written = _pictures(draw, shots, out, kinds, photographs)
-    for file in written:
-        print(file)
-    print(f"{len(gaussians)} Gaussians drawn in {len(shots)} pictures; open {out} in any {_viewer(out)}")
+    for file in written if len(written) <= MOST_LISTED else [f"{len(written)} files in {out}"]:
+        print(f"wrote {file}")
+    pictures = "1 picture" if len(shots) == 1 else f"{len(shots)} pictures"
+    print(f"{len(gaussians):,} Gaussians drawn in {pictures}; open {out} in any {_viewer(out)}")
 
 
 def main() -> None:
     """Run the command."""
     typer.run(render)
+
+
+def _check_out(out: Path) -> None:
+    """Refuse the name of a kind of picture or video that is not made, which is hardly meant to be a folder."""
+    from .images import SUFFIXES as PICTURES
+    from .video import SUFFIXES as VIDEOS
+
+    if out.suffix.lower() in {*PICTURES, *VIDEOS, ".gif"} - {PICTURE, VIDEO} and not out.is_dir():
+        raise InputError(f"--out {out}: expected a folder, or a file that ends in {PICTURE} or {VIDEO}")
 
 
 def _shots(

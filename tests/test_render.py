@@ -324,6 +324,17 @@ def test_an_orbit_as_a_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ca
     assert "orbit-depth.mp4" in capsys.readouterr().out
 
 
+def test_many_pictures_are_said_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_ply(Path("scene.ply"), a_ball_of_gaussians())
+    assert run(monkeypatch, "scene.ply", "--orbit", "--frames", 9, "--depth", "--size", "24x32", "--out", "out") == 0
+    wrote, drawn = capsys.readouterr().out.splitlines()
+    assert wrote == "wrote 27 files in out" and drawn.endswith("drawn in 9 pictures; open out in any image viewer")
+    assert len(list(Path("out").iterdir())) == 27
+
+
 def test_a_path_through_the_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ball = a_ball_of_gaussians((0, 0, 0))
     write_ply(tmp_path / "scene.ply", ball)
@@ -351,6 +362,8 @@ def test_a_path_through_the_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (("--out", "a.png", "--cameras", "cameras.json"), "2 pictures do not fit one file"),
         (("--out", "a.png", "--orbit"), "90 pictures do not fit one file"),
         (("--out", "nowhere/a.mp4"), "cannot write into nowhere"),
+        (("--out", "a.jpg"), "--out a.jpg: expected a folder, or a file that ends in .png or .mp4"),
+        (("--out", "a.MOV", "--orbit"), "expected a folder, or a file that ends in .png or .mp4"),
     ],
 )
 def test_requests_that_make_no_picture(
