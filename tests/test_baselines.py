@@ -1,4 +1,4 @@
-"""The trivial methods: a plane's pictures are known exactly, so the best plane must find it."""
+"""The methods beside the model: a plane's pictures are known exactly, so best plane and true depth must draw them."""
 
 import numpy as np
 import pytest
@@ -6,9 +6,10 @@ from idesplat.runtime.cameras import read_cameras
 from idesplat.runtime.depth_range import DepthRange
 from idesplat.runtime.images import find_images
 from idesplat.runtime.views import match
-from idesplat.tools.baselines import best_plane, nearest_view, warp_plane
-from idesplat.tools.cases import Posed
+from idesplat.tools.baselines import best_plane, nearest_view, splats_at, warp_plane
+from idesplat.tools.cases import Posed, seen_by, unproject
 from idesplat.tools.metrics import psnr
+from idesplat.tools.novel_views import draw
 from idesplat.tools.scene_cases import load_case
 from idesplat.tools.scenes import look_at
 
@@ -99,3 +100,43 @@ def test_no_plane_of_a_dense_sweep_is_better(scene) -> None:
     assert psnr(picture, truth, valid) > max(sweep) - 0.02
     np.testing.assert_allclose(picture, warp_plane(context, pose, K, 1 / depth), atol=1e-3)
     assert psnr(picture, truth, valid) > psnr(context.picture(nearest_view(context, pose)), truth, valid) + 1
+
+
+def wall_depth(pose: np.ndarray) -> np.ndarray:
+    """z-depth of the wall z = DEPTH in a camera, [HEIGHT, WIDTH]."""
+    x, y = np.meshgrid((np.arange(WIDTH) + 0.5) / WIDTH, (np.arange(HEIGHT) + 0.5) / HEIGHT)
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(INTRINSICS).T @ pose[:3, :3].T
+    return (DEPTH - pose[2, 3]) / rays[..., 2]
+
+
+def test_splats_at_the_true_depth_draw_the_wall() -> None:
+    context, target = posed(CONTEXT), posed([STRAIGHT])
+    depth = np.stack([wall_depth(pose) for pose in CONTEXT])
+    np.testing.assert_allclose(unproject(depth[0], context, 0)[..., 2], DEPTH)
+    drawn = draw(splats_at(depth, context), target, 0)
+    np.testing.assert_allclose(inner(drawn.rgb), inner(target.picture(0)), atol=0.05)
+    off = draw(splats_at(1.5 * depth, context), target, 0)
+    assert np.abs(inner(off.rgb) - inner(target.picture(0))).max() > 0.3
+
+
+def test_seen_is_what_no_surface_hides_and_no_border_cuts_off() -> None:
+    views = posed([STRAIGHT])
+    depth = np.full((1, HEIGHT, WIDTH), DEPTH)
+    depth[0, :, : WIDTH // 2] = DEPTH / 2  # a nearer surface on the left
+    K = views.K(0)
+
+    def point(x: float, y: float, z: float) -> np.ndarray:
+        return z * np.linalg.inv(K) @ np.array([x, y, 1])
+
+    left, right, y = 10.3, WIDTH - 10.3, 20.7
+    expected = {
+        (left, y, DEPTH / 2): True,
+        (left, y, DEPTH): False,  # behind the nearer surface
+        (right, y, DEPTH): True,
+        (right, y, DEPTH / 2): False,  # in the air
+        (WIDTH + 1, y, DEPTH): False,
+        (right, -1, DEPTH): False,
+        (right, y, -DEPTH): False,
+    }
+    points = np.array([[point(*place) for place in expected]])
+    np.testing.assert_array_equal(seen_by(points, depth, views), [list(expected.values())])

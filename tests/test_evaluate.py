@@ -159,7 +159,8 @@ def test_procedural_scenes_have_true_depth(workplace: Path, opened: Runner, caps
     error = np.abs(prediction.depth - sample.depth[:3]) / sample.depth[:3]
     assert content["mean"]["model"]["abs_rel"] == pytest.approx(error.mean(), rel=1e-5)
     assert content["mean"]["model"]["within_5_percent"] == pytest.approx((error < 0.05).mean())
-    assert set(content["mean"]) == {"model", "nearest", "plane"}
+    assert set(content["mean"]) == {"model", "nearest", "plane", "true depth"}
+    assert content["mean"]["true depth"]["psnr_seen"] > content["mean"]["nearest"]["psnr_seen"]
     assert "1 held-out procedural scenes, 3 of 3 views, 64x96" in capsys.readouterr().out
 
 

@@ -1,14 +1,17 @@
-"""What two trivial methods make of a target view: the nearest photograph copied, and one plane between them warped.
+"""What other methods make of a target view: the nearest photograph copied, one plane warped, and true depth in splats.
 
 The plane stands upright before the target camera, and its depth is the one that comes closest to the target itself: no
 way of choosing a depth from the photographs alone can find a better one. A method that beats it has found relief.
+Splats at the true depth, one of its colour for each pixel, show what no depth can mend: what no photograph saw, and how
+coarsely splats draw.
 """
 
 from math import ceil
 
 import numpy as np
 
-from .cases import Posed
+from ..runtime.gaussians import Gaussians
+from .cases import Posed, unproject
 
 # Planes that are tried: at first neighbours move no pixel by much more than one, then around the best ones closer.
 FEWEST_PLANES, MOST_PLANES = 64, 1024
@@ -17,6 +20,10 @@ KEPT = 3
 CLOSER = 8
 ROUNDS = 2
 TINY = 1e-9
+# Splats by rule: their standard deviation in pixels, and their opacity.
+SPLAT_PIXELS, SPLAT_OPACITY = 0.5, 0.95
+# The spherical harmonic of degree 0.
+SH_0 = 0.28209479177387814
 
 
 def nearest_view(context: Posed, extrinsics: np.ndarray) -> int:
@@ -72,6 +79,21 @@ def warp_plane(context: Posed, extrinsics: np.ndarray, K: np.ndarray, inverse_de
         total += share
     copied = context.picture(nearest_view(context, extrinsics))
     return np.where(total > 0, mixed / np.maximum(total, TINY), copied)
+
+
+def splats_at(depth: np.ndarray, context: Posed) -> Gaussians:
+    """A round splat for every pixel of the context, at its z-depth [views, height, width] and of its colour."""
+    views = len(context)
+    means = np.concatenate([unproject(depth[view], context, view).reshape(-1, 3) for view in range(views)])
+    pixels = np.concatenate([(depth[view] / context.K(view)[0, 0]).ravel() for view in range(views)])
+    colours = context.images.transpose(0, 2, 3, 1).reshape(-1, 3)
+    return Gaussians(
+        means.astype(np.float32),
+        np.repeat(SPLAT_PIXELS * pixels[:, None], 3, axis=1).astype(np.float32),
+        np.tile(np.array([1, 0, 0, 0], np.float32), (len(means), 1)),
+        np.full(len(means), SPLAT_OPACITY, np.float32),
+        ((colours - 0.5) / SH_0)[:, None].astype(np.float32),
+    )
 
 
 def _warped(context: Posed, view: int, homography: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -4,6 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+# Depths that differ by less than this share are of one surface.
+SAME_SURFACE = 0.02
+
 
 @dataclass(frozen=True, eq=False)
 class Posed:
@@ -41,6 +44,8 @@ class Case:
 
     near, far: the depth range, in scene units. depth: true z-depth of the context views in scene units,
     [views, height, width], not positive where unknown; None where there is none.
+    seen: whether some context view sees what a pixel of a target shows, bool [targets, height, width]; None where that
+    is not known.
     """
 
     name: str
@@ -49,6 +54,7 @@ class Case:
     near: float
     far: float
     depth: np.ndarray | None = None
+    seen: np.ndarray | None = None
 
 
 def procedural_case(seed: int, context: int, drawn: int, targets: int, height: int, width: int) -> Case:
@@ -67,11 +73,36 @@ def procedural_case(seed: int, context: int, drawn: int, targets: int, height: i
         valid = np.ones((len(images), height, width), bool)
         return Posed(names, images, sample.extrinsics[views], sample.intrinsics[views], valid)
 
-    return Case(
-        str(seed),
-        posed("context", given),
-        posed("target", slice(drawn, None)),
-        sample.near,
-        sample.far,
-        sample.depth[given],
+    chosen, targets_posed = posed("context", given), posed("target", slice(drawn, None))
+    depth = sample.depth[given]
+    seen = np.stack(
+        [
+            seen_by(unproject(sample.depth[drawn + target], targets_posed, target), depth, chosen)
+            for target in range(targets)
+        ]
     )
+    return Case(str(seed), chosen, targets_posed, sample.near, sample.far, depth, seen)
+
+
+def unproject(depth: np.ndarray, views: Posed, view: int) -> np.ndarray:
+    """The points that a view's pixels show, in world axes: z-depth [height, width] -> [height, width, 3], float64."""
+    height, width = depth.shape
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(views.K(view)).T
+    pose = views.extrinsics[view].astype(np.float64)
+    return rays * depth[..., None] @ pose[:3, :3].T + pose[:3, 3]
+
+
+def seen_by(points: np.ndarray, depth: np.ndarray, views: Posed) -> np.ndarray:
+    """Whether points [height, width, 3] are seen by some view, from the views' true z-depth [views, height, width]."""
+    seen = np.zeros(points.shape[:2], bool)
+    for view, surface in enumerate(depth):
+        pose = views.extrinsics[view].astype(np.float64)
+        local = (points - pose[:3, 3]) @ pose[:3, :3]
+        z = local[..., 2]
+        place = local @ views.K(view).T / np.where(z > 0, z, np.inf)[..., None]
+        column, row = np.floor(place[..., 0]).astype(int), np.floor(place[..., 1]).astype(int)
+        inside = (z > 0) & (column >= 0) & (column < surface.shape[1]) & (row >= 0) & (row < surface.shape[0])
+        met = surface[np.where(inside, row, 0), np.where(inside, column, 0)]
+        seen |= inside & (np.abs(met - z) < SAME_SURFACE * z)
+    return seen

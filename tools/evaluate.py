@@ -109,7 +109,7 @@ def chunks(
         raise InputError(
             f"near {near:g} and far {far:g}: expected 0 < near < far; give --near and --far in scene units"
         )
-    evaluator = Evaluator(runner, load_lpips(), trivial=False, nearest_drawn=NEAREST_DRAWN * near)
+    evaluator = Evaluator(runner, load_lpips(), compare=False, nearest_drawn=NEAREST_DRAWN * near)
     skipped: dict[str, str] = {}
     cases = chunk_cases(files, entries, shape, (near, far), skipped.__setitem__)
     results = _evaluate(cases, len(entries), evaluator, out, PICTURED, skipped.__setitem__)

@@ -1,4 +1,4 @@
-"""One case through an exported model: its target views drawn, and measured beside what trivial methods make of them."""
+"""One case through an exported model: its target views drawn, and measured beside what other methods make of them."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -12,11 +12,11 @@ from ..runtime.gaussians import Gaussians
 from ..runtime.images_out import depth_colours
 from ..runtime.rasterizer import Rendering, rasterize
 from ..runtime.runner import Runner
-from .baselines import best_plane, nearest_view
+from .baselines import best_plane, nearest_view, splats_at
 from .cases import Case, Posed
 from .metrics import LPIPS, depth_measures, psnr, ssim
 
-MODEL, NEAREST, PLANE = "model", "nearest", "plane"
+MODEL, NEAREST, PLANE, TRUE_DEPTH = "model", "nearest", "plane", "true depth"
 # World units from the camera at which Gaussians begin to be drawn, where nothing else is asked for.
 NEAREST_DRAWN = 0.01
 # A mean difference of the colours from here on has the brightest colour.
@@ -33,7 +33,7 @@ Scores = dict[str, dict[str, float]]
 class Target:
     """The measures of a target view, by method and measure.
 
-    details: what the trivial methods found, the nearest view's name and the plane's depth in scene units.
+    details: what the other methods found, the nearest view's name and the plane's depth in scene units.
     """
 
     name: str
@@ -57,13 +57,13 @@ class Result:
 class Evaluator:
     """A model and how it is measured.
 
-    lpips: the measure, where it is there. trivial: whether the trivial methods are measured too.
+    lpips: the measure, where it is there. compare: whether other methods are measured, too.
     nearest_drawn: scene units from the camera at which Gaussians begin to be drawn.
     """
 
     runner: Runner
     lpips: LPIPS | None
-    trivial: bool = True
+    compare: bool = True
     nearest_drawn: float = NEAREST_DRAWN
 
     def evaluate(self, case: Case, show: Callable[[str, np.ndarray], None] | None = None) -> Result:
@@ -80,19 +80,37 @@ class Evaluator:
             drawn = draw(prediction.need_gaussians(), case.targets, view, self.nearest_drawn)
             pictures: dict[str, np.ndarray] = {MODEL: drawn.rgb}
             details: dict[str, Any] = {}
-            if self.trivial:
-                others, details = _trivial(case, view)
+            if self.compare:
+                others, details = self._others(case, view)
                 pictures |= others
-            scores = {method: self._measure(picture, truth, valid) for method, picture in pictures.items()}
+            seen = None if case.seen is None else case.seen[view] & valid
+            scores = {method: self._measure(picture, truth, valid, seen) for method, picture in pictures.items()}
             targets.append(Target(name, scores, details))
             if show is not None:
                 show(name, _strip(truth, valid, drawn, pictures.get(PLANE)))
         depth = {} if case.depth is None else depth_measures(prediction.depth, case.depth)
         return Result(case.name, given.names, case.near, case.far, targets, depth)
 
-    def _measure(self, picture: np.ndarray, truth: np.ndarray, valid: np.ndarray) -> dict[str, float]:
+    def _others(self, case: Case, view: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Other methods' pictures of a target, [height, width, 3], and what they found."""
+        context, targets, pose = case.context, case.targets, case.targets.extrinsics[view]
+        copied = nearest_view(context, pose)
+        truth, valid = targets.picture(view), targets.valid[view]
+        plane, depth = best_plane(context, truth, valid, pose, targets.K(view), case.near, case.far)
+        pictures = {NEAREST: context.picture(copied), PLANE: plane}
+        if case.depth is not None and (case.depth > 0).all():
+            pictures[TRUE_DEPTH] = draw(splats_at(case.depth, context), targets, view, self.nearest_drawn).rgb
+        return pictures, {"nearest_view": context.names[copied], "plane_depth": depth}
+
+    def _measure(
+        self, picture: np.ndarray, truth: np.ndarray, valid: np.ndarray, seen: np.ndarray | None
+    ) -> dict[str, float]:
         scores = {"psnr": psnr(picture, truth, valid), "ssim": ssim(picture, truth, valid)}
-        return scores if self.lpips is None else {**scores, "lpips": self.lpips(picture, truth, valid)}
+        if seen is not None:
+            scores["psnr_seen"] = psnr(picture, truth, seen)
+        if self.lpips is not None:
+            scores["lpips"] = self.lpips(picture, truth, valid)
+        return scores
 
 
 def mean_of_views(results: Sequence[Result]) -> Scores:
@@ -130,16 +148,6 @@ def _mean(entries: list[Scores]) -> Scores:
         method: {measure: float(np.mean([entry[method][measure] for entry in entries])) for measure in measures}
         for method, measures in entries[0].items()
     }
-
-
-def _trivial(case: Case, view: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The trivial methods' pictures of a target, [height, width, 3], and what they found."""
-    context, targets, pose = case.context, case.targets, case.targets.extrinsics[view]
-    copied = nearest_view(context, pose)
-    truth, valid = targets.picture(view), targets.valid[view]
-    plane, depth = best_plane(context, truth, valid, pose, targets.K(view), case.near, case.far)
-    pictures = {NEAREST: context.picture(copied), PLANE: plane}
-    return pictures, {"nearest_view": context.names[copied], "plane_depth": depth}
 
 
 def _strip(truth: np.ndarray, valid: np.ndarray, drawn: Rendering, plane: np.ndarray | None) -> np.ndarray:

@@ -15,12 +15,13 @@ from .novel_views import MODEL, Result, Scores
 RESULTS = "results.json"
 TITLES = {
     "psnr": "PSNR, dB",
+    "psnr_seen": "PSNR where seen, dB",
     "ssim": "SSIM",
     "lpips": "LPIPS",
     "abs_rel": "AbsRel",
     "within_5_percent": "within 5 %",
 }
-DECIMALS = {"psnr": 2}
+DECIMALS = {"psnr": 2, "psnr_seen": 2}
 USUAL_DECIMALS = 3
 WIDTH = 110  # columns, where there is no terminal to ask
 
@@ -48,11 +49,11 @@ def print_means(means: Scores, title: str) -> None:
     table.add_column("mean")
     for method in means:
         table.add_column(method, justify="right")
-    trivial = [method for method in means if method != MODEL]
-    for method in trivial:
+    compared = [method for method in means if method != MODEL]
+    for method in compared:
         table.add_column(f"over {method}", justify="right")
     for measure, value in means[MODEL].items():
-        others = [means[method].get(measure) for method in trivial]
+        others = [means[method].get(measure) for method in compared]
         cells = ["" if other is None else _number(measure, other) for other in others]
         gains = ["" if other is None else _number(measure, value - other, sign="+") for other in others]
         table.add_row(TITLES[measure], _number(measure, value), *cells, *gains)
