@@ -5,12 +5,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from . import video
 from .camera_format import ESTIMATE, CameraFormat
-from .cameras import Camera, read_cameras, recognise
-from .cameras_re10k import timestamps
+from .cameras import Camera, read_cameras
 from .errors import InputError
-from .images import cover, find_images, stem
+from .images import cover, stem
+from .photographs import find_photographs
 from .runner import Runner
 from .sizes import nearest_size, parse_size
 from .view_choice import FEWEST_VIEWS
@@ -51,9 +50,10 @@ def read_inputs(request: Request, runner: Runner) -> Inputs:
     Raises InputError for whatever cannot be used.
     """
     with tempfile.TemporaryDirectory() as folder:
-        images = _find_pictures(request, Path(folder))
+        given = None if request.cameras == ESTIMATE else Path(request.cameras)
+        images = find_photographs(request.images, given, request.camera_format, Path(folder))
         notes = []
-        if request.cameras == ESTIMATE:
+        if given is None:
             from .estimate import estimate_cameras
 
             images = pick_frames(images, request.frames)
@@ -61,7 +61,7 @@ def read_inputs(request: Request, runner: Runner) -> Inputs:
             notes.append(_estimated(len(images), cameras))
             images = [Path(camera.name) for camera in cameras]
         else:
-            cameras = read_cameras(Path(request.cameras), images, request.camera_format)
+            cameras = read_cameras(given, images, request.camera_format)
             images = pick_frames(images, request.frames)
         pairs = match(images, cameras)
         if request.frames is None and len(cameras) > len(pairs):
@@ -104,25 +104,6 @@ def pick_frames(images: Sequence[Path], frames: str | None) -> list[Path]:
     if len(set(picked)) < len(picked):
         raise InputError(f"--frames {frames}: names an image twice, expected each once")
     return picked
-
-
-def _find_pictures(request: Request, folder: Path) -> list[Path]:
-    """The images given, or frames of a video, written to `folder`."""
-    videos = [path for path in request.images if video.is_video(path)]
-    if not videos:
-        return find_images(request.images)
-    if len(request.images) > 1:
-        raise InputError(f"{videos[0]}: a video and {len(request.images) - 1} other images given, expected it alone")
-    if request.cameras == ESTIMATE:
-        return video.sample_frames(videos[0], folder)
-    return video.named_frames(videos[0], _names(Path(request.cameras), request.camera_format), folder)
-
-
-def _names(cameras: Path, camera_format: CameraFormat | None) -> list[str]:
-    """The pictures that a file of cameras names, before any picture is there."""
-    if (camera_format or recognise(cameras)) is CameraFormat.RE10K:
-        return timestamps(cameras)
-    return [camera.name for camera in read_cameras(cameras, (), camera_format)]
 
 
 def _wanted(request: Request, runner: Runner) -> int | None:

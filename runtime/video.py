@@ -47,9 +47,9 @@ def named_frames(video: Path, names: Sequence[str], folder: Path) -> list[Path]:
     """
     rate = _frame_rate(video)
     name_of = {number: f"{_stem(name)}.png" for name in names if (number := _number(name, video, rate)) is not None}
-    if not name_of:
+    if len(name_of) < min(2, len(names)):  # numbers of photographs may look like the first microseconds of it
         raise InputError(
-            f"{video}: no camera names one of its frames, such as {video.stem}-000000.png or a time in microseconds; "
+            f"{video}: the cameras do not name its frames, such as {video.stem}-000000.png or a time in microseconds; "
             "give the photographs that the cameras were made for, or --cameras estimate"
         )
     spread = np.linspace(0, len(name_of) - 1, min(FRAMES, len(name_of))).round().astype(int)

@@ -11,6 +11,7 @@ from .cameras import CameraFormat
 from .errors import InputError, exit_on_input_error
 
 if TYPE_CHECKING:
+    from .cameras import Camera
     from .viewer import Viewpoint
 
 LOOPBACK = "127.0.0.1"
@@ -25,7 +26,8 @@ def view(
         CameraFormat | None, typer.Option(help="What --cameras is, where that is not recognised.")
     ] = None,
     images: Annotated[
-        list[Path] | None, typer.Option(help="Folder, glob or files of the cameras' photographs.", show_default=False)
+        list[Path] | None,
+        typer.Option(help="Folder, glob or files of the cameras' photographs, or their video.", show_default=False),
     ] = None,
     more_images: Annotated[list[Path] | None, typer.Argument(hidden=True)] = None,
     html: Annotated[
@@ -37,7 +39,8 @@ def view(
 ) -> None:
     """Look at a splat file in the browser, from the first camera, with the cameras and their photographs around it.
 
-    With --images only the cameras of these photographs are drawn. Nothing is fetched from the network.
+    With --images only the cameras of these photographs are drawn. A click at a camera leads there (not in an .html).
+    Nothing is fetched from the network.
     """
     from .formats import read_scene
 
@@ -46,13 +49,14 @@ def view(
     if html is not None:
         _check_page(html)
     gaussians = read_scene(scene)
-    viewpoints = _viewpoints(cameras, camera_format, [*(images or []), *(more_images or [])])
+    viewpoints = read_viewpoints(cameras, camera_format, [*(images or []), *(more_images or [])])
     if html is None:
         from .viewer import serving
 
         with serving(gaussians, viewpoints, host, port) as server, contextlib.suppress(KeyboardInterrupt):
             address = f"http://{host}:{server.get_port()}"
-            print(f"{len(gaussians):,} Gaussians to look at: {address} (stop with Ctrl-C)", flush=True)
+            click = "a click at a camera leads there, " if viewpoints else ""
+            print(f"{len(gaussians):,} Gaussians to look at: {address} ({click}stop with Ctrl-C)", flush=True)
             if browser:
                 webbrowser.open(address)
             server.sleep_forever()
@@ -82,12 +86,16 @@ def _check_page(html: Path) -> None:
     check_writable(html.parent)
 
 
-def _viewpoints(cameras: Path | None, form: CameraFormat | None, images: list[Path]) -> "list[Viewpoint]":
-    """The cameras of the photographs, with these, without distortion; all cameras where there are no photographs."""
+def read_viewpoints(cameras: Path | None, form: CameraFormat | None, images: list[Path]) -> "list[Viewpoint]":
+    """The cameras of the photographs, with these, without distortion; all cameras where there are no photographs.
+
+    Raises InputError for what cannot be read, or does not belong together.
+    """
+    import tempfile
     from dataclasses import replace
 
-    from .cameras import located, read_cameras, resized
-    from .images import find_images, load_image, undistort
+    from .cameras import read_cameras
+    from .photographs import find_photographs
     from .progress import progress
     from .viewer import Viewpoint
     from .views import match
@@ -99,12 +107,20 @@ def _viewpoints(cameras: Path | None, form: CameraFormat | None, images: list[Pa
             Viewpoint(replace(camera, distortion=None, fisheye=False), None)
             for camera in read_cameras(cameras, form=form)
         ]
-    files = find_images(images)
-    viewpoints = []
-    for file, camera in progress(match(files, read_cameras(cameras, files, form)), "reading photographs"):
-        photograph = load_image(file)
-        with located(str(file)):
-            camera = resized(camera, photograph.shape[1], photograph.shape[0])
-        photograph, camera = undistort(photograph, camera)
-        viewpoints.append(Viewpoint(camera, photograph))
-    return viewpoints
+    with tempfile.TemporaryDirectory() as folder:
+        files = find_photographs(images, cameras, form, Path(folder))
+        pairs = match(files, read_cameras(cameras, files, form))
+        return [_viewpoint(file, camera) for file, camera in progress(pairs, "reading photographs")]
+
+
+def _viewpoint(file: Path, camera: "Camera") -> "Viewpoint":
+    """A camera with its photograph, without distortion."""
+    from .cameras import located, resized
+    from .images import load_image, undistort
+    from .viewer import Viewpoint
+
+    photograph = load_image(file)
+    with located(str(file)):
+        camera = resized(camera, photograph.shape[1], photograph.shape[0])
+    photograph, camera = undistort(photograph, camera)
+    return Viewpoint(camera, photograph)

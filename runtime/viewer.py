@@ -9,6 +9,8 @@ import io
 import math
 import socket
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -60,7 +62,8 @@ def serving(
 ) -> Iterator["viser.ViserServer"]:
     """A server of the page for as long as the block runs; port 0 for any that is free.
 
-    The page starts at the first viewpoint or, without any, where the whole scene is seen.
+    The page starts at the first viewpoint or, without any, where the whole scene is seen. A click at another viewpoint
+    leads there.
     Raises InputError if viser is not installed, the place cannot be served at, or there is nothing to see.
     """
     first = viewpoints[0].camera if viewpoints else overview(gaussians, *SIZE)
@@ -72,8 +75,7 @@ def serving(
         if viewpoints:
             server.initial_camera.near = NEAR
         _add_gaussians(server, gaussians, first.extrinsics[:3, 3], unit)
-        for index, view in enumerate(viewpoints):
-            _add_viewpoint(server, index, view, first.extrinsics[:3, 3], unit)
+        _add_viewpoints(server, [_moved(view, first.extrinsics[:3, 3], unit) for view in viewpoints])
         yield server
     finally:
         with _quiet():
@@ -141,7 +143,21 @@ def _add_gaussians(server: "viser.ViserServer", gaussians: Gaussians, origin: np
     )
 
 
-def _add_viewpoint(server: "viser.ViserServer", index: int, view: Viewpoint, origin: np.ndarray, unit: float) -> None:
+def _moved(view: Viewpoint, origin: np.ndarray, unit: float) -> Viewpoint:
+    """The viewpoint in the page's frame."""
+    extrinsics = view.camera.extrinsics.copy()
+    extrinsics[:3, 3] = unit * (extrinsics[:3, 3] - origin)
+    return view._replace(camera=replace(view.camera, extrinsics=extrinsics))
+
+
+def _add_viewpoints(server: "viser.ViserServer", viewpoints: Sequence[Viewpoint]) -> None:
+    """Frusta, with photographs where there are any; a click at one leads the page's camera there."""
+    cameras = [view.camera for view in viewpoints]
+    for index, view in enumerate(viewpoints):
+        _add_frustum(server, index, view).on_click(partial(_stand_there, view.camera, cameras))
+
+
+def _add_frustum(server: "viser.ViserServer", index: int, view: Viewpoint) -> "viser.CameraFrustumHandle":
     camera, photograph = view
     fov = _field_of_view(camera)
     aspect = camera.width / camera.K[0, 0] * camera.K[1, 1] / camera.height
@@ -150,7 +166,7 @@ def _add_viewpoint(server: "viser.ViserServer", index: int, view: Viewpoint, ori
         photograph = cv2.resize(photograph, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     # viser's scale is that of a pyramid of volume 4 / 9, whatever its angles
     scale = FRUSTUM_DEPTH * float(np.cbrt(math.tan(fov / 2) ** 2 * aspect / 3))
-    server.scene.add_camera_frustum(
+    return server.scene.add_camera_frustum(
         f"/photographs/{index} {PurePosixPath(camera.name).name}",
         fov,
         aspect,
@@ -158,10 +174,39 @@ def _add_viewpoint(server: "viser.ViserServer", index: int, view: Viewpoint, ori
         thickness=LINE,
         image=photograph,
         wxyz=quaternions_from_matrices(camera.extrinsics[None, :3, :3])[0],
-        position=unit * (camera.extrinsics[:3, 3] - origin),
+        position=camera.extrinsics[:3, 3],
         cast_shadow=False,
         receive_shadow=False,
     )
+
+
+def _stand_there(clicked: Camera, cameras: Sequence[Camera], click: "viser.SceneNodePointerEvent") -> None:
+    """Move the page's camera to the one that was clicked at.
+
+    viser takes the first on the pointer's way, which may be the unseen one that the page's camera stands at.
+    """
+    start, direction = np.array(click.ray_origin), np.array(click.ray_direction)
+    distances = [_distance(camera, start, direction) for camera in cameras]
+    met = [index for index, distance in enumerate(distances) if distance > NEAR]
+    if not met and np.linalg.norm(start - clicked.extrinsics[:3, 3]) <= NEAR:
+        return
+    camera = cameras[min(met, key=distances.__getitem__)] if met else clicked
+    rotation, position = camera.extrinsics[:3, :3], camera.extrinsics[:3, 3]
+    with click.client.atomic():
+        page = click.client.camera
+        page.position = position
+        page.wxyz = quaternions_from_matrices(rotation[None])[0]
+        page.look_at = position + DISTANCE * rotation[:, 2]
+        page.fov = _field_of_view(camera)
+
+
+def _distance(camera: Camera, start: np.ndarray, direction: np.ndarray) -> float:
+    """How far along a ray, from `start` [3] in a `direction` [3], a camera's photograph is; NaN if it is not met."""
+    rotation, position = camera.extrinsics[:3, :3], camera.extrinsics[:3, 3]
+    start, direction = (start - position) @ rotation, direction @ rotation  # in the camera's frame
+    distance = (FRUSTUM_DEPTH - start[2]) / direction[2] if direction[2] else math.nan
+    x, y = np.diag(camera.K)[:2] * (start + distance * direction)[:2] / FRUSTUM_DEPTH  # pixels from the middle
+    return distance if abs(x) <= camera.width / 2 and abs(y) <= camera.height / 2 else math.nan
 
 
 def _field_of_view(camera: Camera) -> float:

@@ -61,7 +61,9 @@ def test_mistakes(clip, tmp_path):
     ):
         with pytest.raises(InputError, match=expected):
             video.sample_frames(tmp_path / name, tmp_path)
-    with pytest.raises(InputError, match=r"clip\.avi: no camera names one of its frames, such as clip-000000\.png"):
+    with pytest.raises(InputError, match=r"clip\.avi: the cameras do not name its frames, such as clip-000000\.png"):
         video.named_frames(clip, ["a.png", "other-000003.png"], tmp_path)
+    with pytest.raises(InputError, match="the cameras do not name its frames"):  # but photographs of another capture
+        video.named_frames(clip, ["0001.jpg", "0002.jpg", "0007.jpg"], tmp_path)
     with pytest.raises(InputError, match=r"damaged|expected two at least"):
         video.sample_frames(tmp_path / "cut.avi", tmp_path)

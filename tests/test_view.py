@@ -11,14 +11,14 @@ import cv2
 import numpy as np
 import pytest
 from conftest import run_command
-from idesplat.runtime.cameras import Camera, write_cameras
+from idesplat.runtime.cameras import Camera, read_cameras, write_cameras
 from idesplat.runtime.drawing import draw_view
 from idesplat.runtime.gaussians import Gaussians, with_colours
 from idesplat.runtime.images_out import save_png
 from idesplat.runtime.ply import write_ply
 from idesplat.runtime.quaternions import quaternions_from_matrices
 from idesplat.runtime.shots import overview
-from idesplat.runtime.view import main
+from idesplat.runtime.view import main, read_viewpoints
 from idesplat.tools.metrics import ssim
 
 WIDTH, HEIGHT = 320, 240
@@ -168,6 +168,34 @@ def test_served_page(opened, served, drawn):
     assert all(url.startswith((address, "blob:", "data:")) for url in page.requests)
 
 
+def test_a_click_at_a_camera_leads_there(opened, served, folder, gaussians, drawn):
+    cameras = ("--cameras", "cameras.json", "--images", "photographs")
+    page = opened(served("scene.ply", *cameras, "--port", 0, "--no-browser"))
+    rows, columns = magenta(page.scene(drawn[:, :FREE])).nonzero()
+    page.page.mouse.click(float(np.median(columns)), float(np.median(rows)))  # through the photograph of the first
+    right = read_cameras(folder / "cameras.json")[1]
+    there = draw_view(gaussians, right.extrinsics, right.K, WIDTH, HEIGHT, WHITE).rgb
+    assert similarity(there, drawn) < TURNED
+    shows(page.scene(there), there)
+    assert page.complaints == []
+
+
+def test_photographs_from_a_video(tmp_path, camera):
+    film = cv2.VideoWriter(str(tmp_path / "clip.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 30, (WIDTH, HEIGHT))
+    for grey in (50, 100, 150):
+        film.write(np.full((HEIGHT, WIDTH, 3), grey, np.uint8))
+    film.release()
+    cameras = [replace(camera, name=f"clip-{number:06}.png") for number in (0, 2)]
+    write_cameras(tmp_path / "cameras.json", cameras)
+    viewpoints = read_viewpoints(tmp_path / "cameras.json", None, [tmp_path / "clip.avi"])
+    assert [round(float(view.photograph.mean()), -1) for view in viewpoints] == [50, 150]
+
+
+def magenta(scene: np.ndarray) -> np.ndarray:
+    """Where the other camera's photograph is seen, [height, width]."""
+    return (scene > [0.8, -1, 0.8]).all(axis=2) & (scene[..., 1] < 0.3)
+
+
 def test_file_to_send(opened, folder, drawn, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     html = tmp_path / "<b>scene.html"
@@ -177,8 +205,7 @@ def test_file_to_send(opened, folder, drawn, tmp_path, monkeypatch, capsys):
     page = opened(html.as_uri())
     scene = page.scene(drawn[:, :FREE])
     shows(scene[:, :FREE], drawn[:, :FREE])
-    magenta = (scene[:, FREE:] > [0.8, -1, 0.8]).all(axis=2) & (scene[:, FREE:, 1] < 0.3)
-    assert magenta.sum() > 500  # the other camera's photograph; its own is not in the way
+    assert magenta(scene[:, FREE:]).sum() > 500  # the other camera's photograph; its own is not in the way
     assert page.complaints == []
     assert all(url.startswith(("file:", "blob:", "data:")) for url in page.requests)
 
