@@ -129,7 +129,8 @@ def infer(
     preparing = time.perf_counter()
     inputs = read_inputs(given, runner)
     prepared = inputs.views
-    span = runner.depth_range(prepared, near, far)
+    with working("finding near and far"):
+        span = runner.depth_range(prepared, near, far)
     predicting = time.perf_counter()
     prediction = _predict(prepared, runner, span)
     writing = time.perf_counter()

@@ -10,6 +10,7 @@ from .cameras import Camera, read_cameras
 from .errors import InputError
 from .images import cover, stem
 from .photographs import find_photographs
+from .progress import working
 from .runner import Runner
 from .sizes import nearest_size, parse_size
 from .view_choice import FEWEST_VIEWS
@@ -61,7 +62,8 @@ def read_inputs(request: Request, runner: Runner) -> Inputs:
             notes.append(_estimated(len(images), cameras))
             images = [Path(camera.name) for camera in cameras]
         else:
-            cameras = read_cameras(given, images, request.camera_format)
+            with working("reading cameras"):
+                cameras = read_cameras(given, images, request.camera_format)
             images = pick_frames(images, request.frames)
         pairs = match(images, cameras)
         if request.frames is None and len(cameras) > len(pairs):
@@ -70,7 +72,8 @@ def read_inputs(request: Request, runner: Runner) -> Inputs:
         height, width = parse_size(request.size) if request.size else runner.size_for(own)
         count = min(_wanted(request, runner) or len(pairs), len(pairs))
         runner.check_size(max(count, FEWEST_VIEWS), height, width)
-        views = prepare(pairs, count, height, width)
+        with working("choosing and reading photographs"):
+            views = prepare(pairs, count, height, width)
     if request.views and request.views > len(pairs):
         notes.append(f"--views {request.views}: all {len(pairs)} photographs used; there are no more with a camera")
     notes += _cut(views.cameras[0], height, width, runner)

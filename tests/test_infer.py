@@ -87,14 +87,19 @@ def test_commands_to_copy_work_in_folders_with_spaces(workplace, capsys):
     assert run_command(view_main, *view[1:], "--html", "page.html") == 0
 
 
-def test_what_is_not_used_is_said(workplace, capsys):
+def test_what_is_not_used_is_said(workplace, capsys, monkeypatch):
     assert run_command(main, *USUAL, "--views", "9") == 0
-    printed = capsys.readouterr().out
-    assert "--views 9: all 5 photographs used" in printed
-    assert "of each photograph is used" not in printed  # nearly all is
+    printed = capsys.readouterr()
+    assert "--views 9: all 5 photographs used" in printed.out
+    assert "of each photograph is used" not in printed.out  # nearly all is
+    assert printed.err == ""  # where that is no terminal
+    monkeypatch.setenv("FORCE_COLOR", "1")
     assert run_command(main, *USUAL, "--size", "128x64", "--frames", "0,1") == 0
     # of 128 x 96 pixels, at a trained size of 96 x 64
-    assert "the middle 128x64 of each photograph is used, 37 % of it; --size " in capsys.readouterr().out
+    printed = capsys.readouterr()
+    assert "the middle 128x64 of each photograph is used, 37 % of it; --size " in printed.out
+    for doing in ("reading cameras", "choosing and reading photographs", "finding near and far", "predicting"):
+        assert doing in printed.err
 
 
 def test_staged_folder_and_a_list_of_files(workplace, exported):
