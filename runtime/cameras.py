@@ -68,13 +68,14 @@ class Camera:
 def located(where: str) -> Iterator[None]:
     """Put `where` (a file, a frame, a field) in front of the message of an InputError raised inside the block.
 
-    Once only: what reads a whole file says which one itself.
+    Once only: what reads a whole file begins with its path, which may end in `where`, or lead through it.
     """
     try:
         yield
     except InputError as error:
-        message = str(error)
-        raise InputError(message if message.startswith(f"{where}: ") else f"{where}: {message}") from None
+        path = Path(str(error).partition(": ")[0])
+        known = where in (path.name, str(path), *map(str, path.parents))
+        raise InputError(str(error) if known else f"{where}: {error}") from None
 
 
 def read_cameras(path: Path, pictures: Sequence[Path] = (), form: CameraFormat | None = None) -> list[Camera]:

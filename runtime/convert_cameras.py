@@ -33,6 +33,7 @@ def convert(
         list[Path] | None,
         typer.Option(help="Folder, glob or files of the photographs, where a format does not name or measure them."),
     ] = None,
+    more_images: Annotated[list[Path] | None, typer.Argument(hidden=True)] = None,
     camera_format: Annotated[
         CameraFormat | None, typer.Option(help="Format of the cameras, where their content does not tell it.")
     ] = None,
@@ -45,7 +46,8 @@ def convert(
         raise InputError(f"{out}: expected a file that ends in .json")
     if out.resolve() == cameras.resolve():
         raise InputError(f"{out}: would replace the cameras that it is made from; choose another name")
-    found = read_cameras(cameras, find_images(images) if images else (), camera_format)
+    pictures = [*(images or []), *(more_images or [])]
+    found = read_cameras(cameras, find_images(pictures) if pictures else (), camera_format)
     write_cameras(out, found)
     print(f"read {len(found)} cameras as {camera_format or recognise(cameras)}: {_lenses(found)}")
     print(f"wrote {out}")

@@ -288,6 +288,11 @@ def test_cam_txt(tmp_path, depths, expected):
     assert_same(read, cameras)
     assert read[0].depth_range == expected
     assert_same(read_cameras(tmp_path / "cams" / "00000003_cam.txt"), cameras[1:])
+    (tmp_path / "cams" / "00000003_cam.txt").write_text("")
+    with pytest.raises(InputError) as refused:
+        read_cameras(tmp_path / "cams")
+    empty = tmp_path / "cams" / "00000003_cam.txt"
+    assert str(refused.value) == f"{empty}: is empty; expected a file of cameras"  # once
 
 
 def test_dtu_counts_pictures_from_one_and_may_give_K_for_a_quarter(tmp_path):

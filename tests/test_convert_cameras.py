@@ -44,6 +44,9 @@ def test_pictures_give_the_size(folder, capsys):
     save_pictures(folder / "frames", ["100.png"])
     assert run_command(main, "convert", "trajectory.txt", "cameras.json", "--images", "frames") == 0
     assert_same(read_cameras(Path("cameras.json")), cameras)
+    first, second = save_pictures(folder / "frames", ["100.png", "200.png"])  # as a shell expands a pattern
+    assert run_command(main, "convert", "trajectory.txt", "other.json", "--images", first, second) == 0
+    assert_same(read_cameras(Path("other.json")), cameras)
 
 
 @pytest.mark.parametrize(
