@@ -1,0 +1,106 @@
+"""The sparse products in ONNX Runtime, gathered at once and in steps: numbers for docs/performance.md.
+
+python -m idesplat.tools.bench_products
+"""
+
+import tempfile
+import warnings
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import numpy as np
+import typer
+
+from .bench import thread_environment
+from .bench_parts import race
+from .bench_worker import Prepared
+
+PAIRS = 2
+INPUTS = ("queries", "table", "rows")
+
+
+class Shape(NamedTuple):
+    """What one product works on: square maps, candidates of a pixel, channels of a row, pixels the candidates span."""
+
+    side: int
+    candidates: int
+    channels: int
+    span: float
+
+
+SHAPES = {
+    "IDESplat, unit 1": Shape(64, 257, 256, 21),
+    "IDESplat, unit 2": Shape(128, 129, 64, 4),
+    "IDESplat, unit 3": Shape(256, 65, 32, 4),
+    "DepthSplat, four pixels a candidate": Shape(64, 512, 128, 21),
+    "idesplat-tiny, unit 1": Shape(64, 97, 64, 21),
+    "idesplat-tiny, unit 2": Shape(128, 25, 32, 4),
+    "idesplat-tiny, unit 3": Shape(256, 9, 8, 4),
+}
+
+
+def main(
+    repeats: Annotated[int, typer.Option(help="Rounds.", min=1)] = 5,
+    threads: Annotated[int, typer.Option(help="ONNX Runtime's threads.", min=1)] = 1,
+) -> None:
+    """Time the correlation and the weighted sum of it, on two pairs of 256x256 views."""
+    with thread_environment(threads):
+        for name, shape in SHAPES.items():
+            contestants = {
+                "gathered at once": (products, shape, False, threads),
+                "in steps": (products, shape, True, threads),
+            }
+            race(f"{name}: correlate and weigh", contestants, repeats)
+
+
+def products(shape: Shape, steps: bool, threads: int) -> Prepared:
+    """Both products, one after the other, as an exported graph has them."""
+    import onnx
+    import onnxruntime
+    import torch
+    from torch import Tensor, nn
+
+    from ..export.sparse_products import FEW, explain, in_steps
+    from ..model.sparse_products import SparseProducts
+
+    class Both(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.products = SparseProducts(FEW if steps else 0)
+
+        def forward(self, queries: Tensor, table: Tensor, rows: Tensor) -> Tensor:
+            return self.products.weigh(self.products.correlate(queries, table, rows), table, rows)
+
+    arrays = example(shape)
+    network = Both()
+    with tempfile.TemporaryDirectory() as folder, in_steps(network), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # deprecation of the path, and tracing warnings
+        path = Path(folder) / "both.onnx"
+        tensors = tuple(torch.from_numpy(array) for array in arrays)
+        torch.onnx.export(network, tensors, str(path), dynamo=False, opset_version=20, input_names=list(INPUTS))
+        model = explain(onnx.load(path))
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    session = onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
+    feed = dict(zip(INPUTS, arrays, strict=True))
+
+    def run() -> None:
+        session.run(None, feed)
+
+    return None, run
+
+
+def example(shape: Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Queries, table and rows of two views whose pixels look along the other's rows."""
+    rng = np.random.default_rng(0)
+    pixels = shape.side**2
+    row, column = np.divmod(np.arange(pixels), shape.side)
+    moved = np.rint(column - np.linspace(0, shape.span, shape.candidates)[:, None]).clip(0, shape.side - 1)
+    inside = (row * shape.side + moved).astype(np.int32)  # [candidates, pixels]
+    table = rng.standard_normal((PAIRS * pixels + 1, shape.channels)).astype(np.float32)
+    queries = rng.standard_normal((PAIRS, pixels, shape.channels)).astype(np.float32)
+    return queries, table, np.stack([inside + pixels, inside])
+
+
+if __name__ == "__main__":
+    typer.run(main)
