@@ -35,6 +35,9 @@ def export(
     staged: Annotated[Path | None, typer.Option(help="Folder for one graph a stage, with a manifest.")] = None,
     views: Annotated[int | None, typer.Option(help="Bake in the number of views.", min=2)] = None,
     size: Annotated[str | None, typer.Option(help="Bake in the image size, such as 256x256.")] = None,
+    precision: Annotated[
+        str, typer.Option(help="float32, int8 (for processors) or fp16 (for graphics cards).")
+    ] = "float32",
 ) -> None:
     """Write a checkpoint as a standard ONNX graph (opset 20), and prove that it computes the same.
 
@@ -45,13 +48,16 @@ def export(
         raise InputError("exporting needs PyTorch and onnx, which are not installed; pip install 'idesplat[export]'")
     from ..model.checkpoint import CheckpointError
     from .exporter import Fixed
+    from .precision import PRECISIONS
 
+    if precision not in PRECISIONS:
+        raise InputError(f"--precision {precision}: unknown; choose one of {', '.join(PRECISIONS)}")
     try:
         model, name, digest = _load(checkpoint, preset)
     except CheckpointError as error:
         raise InputError(str(error)) from None
     fixed = Fixed(views, _fitting_size(size, model.config.size_multiple) if size else None)
-    description = describe(model, name, checkpoint.name, digest, fixed)
+    description = describe(model, name, checkpoint.name, digest, fixed, precision)
     if not _export(model, description, fixed, folder, out, staged):
         print("error: the graph departs from the network (see the table); nothing was written", file=sys.stderr)
         raise SystemExit(PARITY_BREACH)
@@ -110,7 +116,9 @@ def _load(checkpoint: Path, preset: str | None) -> "tuple[Network, str, str]":
     return model.eval(), name, digest
 
 
-def describe(model: "Network", preset: str, checkpoint: str, digest: str, fixed: "Fixed") -> Description:
+def describe(
+    model: "Network", preset: str, checkpoint: str, digest: str, fixed: "Fixed", precision: str = "float32"
+) -> Description:
     """What an exported network says of itself."""
     from ..model.depthsplat import DepthSplatDepth
 
@@ -132,6 +140,7 @@ def describe(model: "Network", preset: str, checkpoint: str, digest: str, fixed:
         checkpoint_sha256=digest,
         version=version("idesplat"),
         gaussians=not isinstance(model, DepthSplatDepth),
+        precision=precision,
     )
 
 

@@ -3,6 +3,7 @@
 import copy
 import logging
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import torch
 
 from ..runtime.bundle import INPUTS, METADATA_KEY, OUTPUTS, Description
 from .optimize import simplify
+from .precision import Feeds, in_precision
 from .sparse_products import explain, in_steps
 from .stages import NamedTensors, Stage, example_inputs, find_stages, stage_graph
 from .weights import fill_inputs
@@ -69,12 +71,21 @@ class Graphs:
 def freeze(network: NamedTensors, description: Description, fixed: Fixed, folder: Path) -> Graphs:
     """Trace a network and cut it into stages, all as files in an empty folder, checked against ONNX's specification."""
     traced = trace(network, description, fixed, folder)
+    traced = in_precision(description.precision, traced, folder / WEIGHTS, _examples(description, fixed))
     whole = _whole_graph(traced)
     graphs = Graphs(folder, find_stages(traced, network.stages), len(whole.graph.node))
     _write(whole, description, graphs.whole)
     for stage in graphs.stages:
         _write(stage_graph(traced, stage), description, graphs.of_stage(stage))
     return graphs
+
+
+def _examples(description: Description, fixed: Fixed) -> Iterator[Feeds]:
+    """Inputs upright and across, to see what ranges a network's numbers have."""
+    across = tuple(blocks * description.size_multiple for blocks in TRACE_BLOCKS)
+    for height, width in [fixed.size] if fixed.size else [across, across[::-1]]:
+        inputs = example_inputs(fixed.views or TRACE_VIEWS, height, width, description.near, description.far)
+        yield {name: tensor.numpy() for name, tensor in inputs.items()}
 
 
 def trace(network: NamedTensors, description: Description, fixed: Fixed, folder: Path) -> onnx.ModelProto:

@@ -14,10 +14,17 @@ from .stages import NamedTensors, example_inputs
 
 # Errors are in standard deviations of the tensor. Within a stage both sides start from the same numbers; what is left
 # is float32 rounding, and the few pixels where a projection falls on the border of two and rounds to the other.
-STAGE_TOLERANCE = 1e-3
+STAGE_TOLERANCE = {
+    "float32": 1e-3,
+    # Numbers of eleven bits, a few of them in a row.
+    "fp16": 1e-2,
+    # A hundred roundings in a row, each to one of 256 numbers over some eight standard deviations and so off by a
+    # hundredth of one, make a tenth. More than twice that is a fault.
+    "int8": 2e-1,
+}
 # End to end those few pixels change what the next stage searches, so errors grow from stage to stage: the released
 # program itself, run on another processor, moves by about a hundredth of this in the median on random weights.
-WHOLE_TOLERANCE = 1e-1
+WHOLE_TOLERANCE = {"float32": 1e-1, "fp16": 1e-1, "int8": 2e-1}
 WHOLE = "end to end"
 # Relative disparity is divided by its largest value, the inverse of the smallest number that a ReLU lets through: its
 # scale is rounding, its shape is not. Below this percentile, at which the scales are matched, no value is extreme.
@@ -54,9 +61,11 @@ def verify(network: NamedTensors, graphs: Graphs, description: Description, fixe
     """Compare the graphs of every stage, and that of the whole, with the network on two shapes."""
     cases = [_case(network, description, *shape) for shape in _shapes(description, fixed)]
     for stage in graphs.stages:
-        yield from _verify(graphs.of_stage(stage), stage.name, stage.outputs, cases, STAGE_TOLERANCE)
+        yield from _verify(
+            graphs.of_stage(stage), stage.name, stage.outputs, cases, STAGE_TOLERANCE[description.precision]
+        )
     results = [name for name in OUTPUTS if name in cases[0].tensors]
-    yield from _verify(graphs.whole, WHOLE, results, cases, WHOLE_TOLERANCE)
+    yield from _verify(graphs.whole, WHOLE, results, cases, WHOLE_TOLERANCE[description.precision])
 
 
 def _shapes(description: Description, fixed: Fixed) -> list[tuple[int, int, int]]:

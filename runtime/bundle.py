@@ -44,6 +44,8 @@ class Description:
     version: str
     # Whether it yields Gaussians, as all models before this field did, or depth alone.
     gaussians: bool = True
+    # What the parts that bear it compute in: float32, int8 or fp16. Inputs, outputs and geometry are always in float32.
+    precision: str = "float32"
     conventions: str = CONVENTIONS
     layout: int = LAYOUT
 
