@@ -163,9 +163,9 @@ def test_curriculum_and_rates() -> None:
     peak = rates.index(max(rates))
     assert rates[peak] == 1 and rates[:peak] == sorted(rates[:peak]) and rates[peak:] == sorted(rates[peak:])[::-1]
     assert rates[0] > 0 and rates[-1] == pytest.approx(0.01, abs=1e-3)
-    # Half the work is done: 0.65 + 0.14 + 0.39 + 0.28 + 1.12 = 2.58 in all, of which 1.46 before the last phase.
+    # Half the work is done: 0.57 + 0.14 + 0.30 + 1.43 + 1.95 = 4.39 in all, of which 1.01 before the last but one phase.
     half = next(step for step, rate in enumerate(rates) if step > peak and rate < 0.505)
-    assert half == pytest.approx(1000 * (0.85 + (0.02 + (2.58 - 0.02) / 2 - 1.18) / 4), abs=1.5)
+    assert half == pytest.approx(1000 * (0.74 + (0.02 + (4.39 - 0.02) / 2 - 1.01) / 11), abs=1.5)
 
 
 def test_scenes_come_in_order_and_repeat() -> None:
@@ -219,7 +219,7 @@ def test_writes_all_that_it_says(finished: Path) -> None:
     assert [entry["step"] for entry in entries if "validation_abs_rel" in entry] == [4, 8]
     assert cv2.imread(str(finished / CURVES)).std() > 5
     pictures = cv2.imread(str(finished / PICTURES))
-    assert pictures.shape == (4 * 32, 6 * 32, 3) and pictures.std() > 5
+    assert pictures.shape == (4 * 64, 6 * 64, 3) and pictures.std() > 5
 
 
 def test_resumed_run_equals_uninterrupted(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
