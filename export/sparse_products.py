@@ -21,12 +21,10 @@ from ..model.sparse_products import SparseProducts, correlate, weigh
 FEW = 256
 # While a network is traced each product is one node of this domain; these functions say what it does.
 DOMAIN = "idesplat"
-HEADER = f'<domain: "{DOMAIN}", opset_import: ["": 20]>'
 # A step takes 16 pixels. Every map has a multiple of them, since its sides are multiples of 4; more leave the cache.
-FUNCTIONS = (
-    # queries [pairs, h * w, channels], table [rows, channels], rows [pairs, candidates, h * w]
-    # -> scores [pairs, candidates, h * w]
-    """correlate (queries, table, rows) => (scores) {
+# What both products share: rows [pairs, candidates, h * w], table [rows, channels] and `by_pixel` [pairs, h * w, ...]
+# -> products [steps, 16, ...], of a step's pixels, each of `shape`, with the rows that they gather.
+STEPS = """
         candidates = Shape <start = 1, end = 2> (rows)
         pixels = Shape <start = 2, end = 3> (rows)
         channels = Shape <start = 1, end = 2> (table)
@@ -36,50 +34,32 @@ FUNCTIONS = (
         rows_shape = Concat <axis = 0> (step, candidates)
         rows_by_pixel = Transpose <perm = [0, 2, 1]> (rows)
         rows_by_step = Reshape (rows_by_pixel, rows_shape)
-        queries_shape = Concat <axis = 0> (step, channels, one)
-        queries_by_step = Reshape (queries, queries_shape)
+        shape = Concat <axis = 0> (step, {shape})
+        by_step = Reshape ({by_pixel}, shape)
         steps_shape = Shape <start = 0, end = 1> (rows_by_step)
         steps = Squeeze (steps_shape)
-        go = Constant <value = bool {1}> ()
-        scores_by_step = Loop <body = some (int64 i, bool going) => (bool go_on, float[p, n, u] some_scores) {
+        go = Constant <value = bool {{1}}> ()
+        products = Loop <body = a_step (int64 i, bool going) => (bool go_on, float[p, a, b] product) {{
             go_on = Identity (going)
             some_rows = Gather (rows_by_step, i)
-            some_queries = Gather (queries_by_step, i)
+            some = Gather (by_step, i)
             gathered = Gather (table, some_rows)
-            some_scores = MatMul (gathered, some_queries)
-        }> (steps, go)
+            product = MatMul ({product})
+        }}> (steps, go)
+"""
+CORRELATE = """correlate (queries, table, rows) => (scores) {{
+        {steps}
         scores_shape = Concat <axis = 0> (all, pixels, candidates)
-        scores_by_pixel = Reshape (scores_by_step, scores_shape)
+        scores_by_pixel = Reshape (products, scores_shape)
         scores = Transpose <perm = [0, 2, 1]> (scores_by_pixel)
-    }""",
-    # probability and rows [pairs, candidates, h * w], table [rows, channels] -> sums [pairs, h * w, channels]
-    """weigh (probability, table, rows) => (sums) {
-        candidates = Shape <start = 1, end = 2> (rows)
-        pixels = Shape <start = 2, end = 3> (rows)
-        channels = Shape <start = 1, end = 2> (table)
-        all = Constant <value_ints = [-1]> ()
-        step = Constant <value_ints = [-1, 16]> ()
-        one = Constant <value_ints = [1]> ()
-        rows_shape = Concat <axis = 0> (step, candidates)
-        rows_by_pixel = Transpose <perm = [0, 2, 1]> (rows)
-        rows_by_step = Reshape (rows_by_pixel, rows_shape)
-        weights_shape = Concat <axis = 0> (step, one, candidates)
-        weights_by_pixel = Transpose <perm = [0, 2, 1]> (probability)
-        weights_by_step = Reshape (weights_by_pixel, weights_shape)
-        steps_shape = Shape <start = 0, end = 1> (rows_by_step)
-        steps = Squeeze (steps_shape)
-        go = Constant <value = bool {1}> ()
-        sums_by_step = Loop <body = some (int64 i, bool going) => (bool go_on, float[p, u, c] some_sums) {
-            go_on = Identity (going)
-            some_rows = Gather (rows_by_step, i)
-            some_weights = Gather (weights_by_step, i)
-            gathered = Gather (table, some_rows)
-            some_sums = MatMul (some_weights, gathered)
-        }> (steps, go)
+    }}""".format(steps=STEPS.format(shape="channels, one", by_pixel="queries", product="gathered, some"))
+WEIGH = """weigh (probability, table, rows) => (sums) {{
+        weights = Transpose <perm = [0, 2, 1]> (probability)
+        {steps}
         sums_shape = Concat <axis = 0> (all, pixels, channels)
-        sums = Reshape (sums_by_step, sums_shape)
-    }""",
-)
+        sums = Reshape (products, sums_shape)
+    }}""".format(steps=STEPS.format(shape="one, candidates", by_pixel="weights", product="some, gathered"))
+FUNCTIONS = tuple(f'<domain: "{DOMAIN}", opset_import: ["": 20]> {text}' for text in (CORRELATE, WEIGH))
 
 
 @contextmanager
@@ -98,7 +78,7 @@ def in_steps(network: nn.Module) -> Iterator[None]:
 def explain(traced: onnx.ModelProto) -> onnx.ModelProto:
     """The graph with standard operators in place of the nodes that `in_steps` left, and named after them."""
     products = {node.output[0]: node.name for node in traced.graph.node if node.domain == DOMAIN}
-    traced.functions.extend(onnx.parser.parse_function(HEADER + function) for function in FUNCTIONS)
+    traced.functions.extend(onnx.parser.parse_function(function) for function in FUNCTIONS)
     model = onnx.inliner.inline_local_functions(traced)
     name = ""
     for node in reversed(model.graph.node):  # a product's result is the last of its nodes
