@@ -43,14 +43,19 @@ def points_from_depth(
     depth: z-depth in world units, [views, height, width]. images: RGB in [0, 1], [views, 3, height, width].
     extrinsics: camera-to-world, OpenCV axes, [views, 4, 4]. intrinsics: normalised by width and height, [views, 3, 3].
     """
-    _, height, width = depth.shape
+    positions = unproject(depth, extrinsics, intrinsics)
+    colours = to_bytes(images).transpose(0, 2, 3, 1)
+    return PointCloud(positions.reshape(-1, 3).astype(np.float32), colours.reshape(-1, 3))
+
+
+def unproject(depth: np.ndarray, extrinsics: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    """Where every pixel's centre lies in the world, [views, height, width, 3] float64; arguments as above."""
+    views, height, width = depth.shape
     x, y = (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
     pixels = np.stack([*np.meshgrid(x, y), np.ones((height, width))], axis=-1).reshape(-1, 3)
     rays = pixels @ np.linalg.inv(intrinsics.astype(np.float64)).swapaxes(1, 2)  # [views, height * width, 3], z = 1
-    points = rays * depth.reshape(len(depth), -1, 1)
-    positions = points @ extrinsics[:, :3, :3].swapaxes(1, 2) + extrinsics[:, None, :3, 3]
-    colours = to_bytes(images).transpose(0, 2, 3, 1)
-    return PointCloud(positions.reshape(-1, 3).astype(np.float32), colours.reshape(-1, 3))
+    points = rays * depth.reshape(views, -1, 1)
+    return (points @ extrinsics[:, :3, :3].swapaxes(1, 2) + extrinsics[:, None, :3, 3]).reshape(*depth.shape, 3)
 
 
 def points_from_gaussians(gaussians: Gaussians) -> PointCloud:

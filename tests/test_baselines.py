@@ -5,9 +5,10 @@ import pytest
 from idesplat.runtime.cameras import read_cameras
 from idesplat.runtime.depth_range import DepthRange
 from idesplat.runtime.images import find_images
+from idesplat.runtime.point_cloud import unproject
 from idesplat.runtime.views import match
 from idesplat.tools.baselines import best_plane, nearest_view, splats_at, warp_plane
-from idesplat.tools.cases import Posed, seen_by, unproject
+from idesplat.tools.cases import Posed, seen_by
 from idesplat.tools.metrics import psnr
 from idesplat.tools.novel_views import draw
 from idesplat.tools.scene_cases import load_case
@@ -112,7 +113,7 @@ def wall_depth(pose: np.ndarray) -> np.ndarray:
 def test_splats_at_the_true_depth_draw_the_wall() -> None:
     context, target = posed(CONTEXT), posed([STRAIGHT])
     depth = np.stack([wall_depth(pose) for pose in CONTEXT])
-    np.testing.assert_allclose(unproject(depth[0], context, 0)[..., 2], DEPTH)
+    np.testing.assert_allclose(unproject(depth[:1], context.extrinsics[:1], context.intrinsics[:1])[..., 2], DEPTH)
     drawn = draw(splats_at(depth, context), target, 0)
     np.testing.assert_allclose(inner(drawn.rgb), inner(target.picture(0)), atol=0.05)
     off = draw(splats_at(1.5 * depth, context), target, 0)

@@ -10,8 +10,9 @@ from math import ceil
 
 import numpy as np
 
-from ..runtime.gaussians import Gaussians
-from .cases import Posed, unproject
+from ..runtime.gaussians import SH_0, Gaussians
+from ..runtime.point_cloud import unproject
+from .cases import Posed
 
 # Planes that are tried: at first neighbours move no pixel by much more than one, then around the best ones closer.
 FEWEST_PLANES, MOST_PLANES = 64, 1024
@@ -22,8 +23,6 @@ ROUNDS = 2
 TINY = 1e-9
 # Splats by rule: their standard deviation in pixels, and their opacity.
 SPLAT_PIXELS, SPLAT_OPACITY = 0.5, 0.95
-# The spherical harmonic of degree 0.
-SH_0 = 0.28209479177387814
 
 
 def nearest_view(context: Posed, extrinsics: np.ndarray) -> int:
@@ -83,9 +82,9 @@ def warp_plane(context: Posed, extrinsics: np.ndarray, K: np.ndarray, inverse_de
 
 def splats_at(depth: np.ndarray, context: Posed) -> Gaussians:
     """A round splat for every pixel of the context, at its z-depth [views, height, width] and of its colour."""
-    views = len(context)
-    means = np.concatenate([unproject(depth[view], context, view).reshape(-1, 3) for view in range(views)])
-    pixels = np.concatenate([(depth[view] / context.K(view)[0, 0]).ravel() for view in range(views)])
+    means = unproject(depth, context.extrinsics, context.intrinsics).reshape(-1, 3)
+    focal = context.intrinsics[:, 0, 0].astype(np.float64) * depth.shape[2]  # pixels
+    pixels = (depth / focal[:, None, None]).ravel()
     colours = context.images.transpose(0, 2, 3, 1).reshape(-1, 3)
     return Gaussians(
         means.astype(np.float32),

@@ -4,6 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..runtime.consistency import seen_from
+from ..runtime.point_cloud import unproject
+
 # Depths that differ by less than this share are of one surface.
 SAME_SURFACE = 0.02
 
@@ -73,36 +76,16 @@ def procedural_case(seed: int, context: int, drawn: int, targets: int, height: i
         valid = np.ones((len(images), height, width), bool)
         return Posed(names, images, sample.extrinsics[views], sample.intrinsics[views], valid)
 
-    chosen, targets_posed = posed("context", given), posed("target", slice(drawn, None))
+    chosen, met = posed("context", given), posed("target", slice(drawn, None))
     depth = sample.depth[given]
-    seen = np.stack(
-        [
-            seen_by(unproject(sample.depth[drawn + target], targets_posed, target), depth, chosen)
-            for target in range(targets)
-        ]
-    )
-    return Case(str(seed), chosen, targets_posed, sample.near, sample.far, depth, seen)
-
-
-def unproject(depth: np.ndarray, views: Posed, view: int) -> np.ndarray:
-    """The points that a view's pixels show, in world axes: z-depth [height, width] -> [height, width, 3], float64."""
-    height, width = depth.shape
-    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(views.K(view)).T
-    pose = views.extrinsics[view].astype(np.float64)
-    return rays * depth[..., None] @ pose[:3, :3].T + pose[:3, 3]
+    seen = seen_by(unproject(sample.depth[drawn:], met.extrinsics, met.intrinsics), depth, chosen)
+    return Case(str(seed), chosen, met, sample.near, sample.far, depth, seen)
 
 
 def seen_by(points: np.ndarray, depth: np.ndarray, views: Posed) -> np.ndarray:
-    """Whether points [height, width, 3] are seen by some view, from the views' true z-depth [views, height, width]."""
-    seen = np.zeros(points.shape[:2], bool)
-    for view, surface in enumerate(depth):
-        pose = views.extrinsics[view].astype(np.float64)
-        local = (points - pose[:3, 3]) @ pose[:3, :3]
-        z = local[..., 2]
-        place = local @ views.K(view).T / np.where(z > 0, z, np.inf)[..., None]
-        column, row = np.floor(place[..., 0]).astype(int), np.floor(place[..., 1]).astype(int)
-        inside = (z > 0) & (column >= 0) & (column < surface.shape[1]) & (row >= 0) & (row < surface.shape[0])
-        met = surface[np.where(inside, row, 0), np.where(inside, column, 0)]
-        seen |= inside & (np.abs(met - z) < SAME_SURFACE * z)
+    """Whether points [..., 3] are seen by some view, from the views' true z-depth [views, height, width]."""
+    seen = np.zeros(points.shape[:-1], bool)
+    for surface, extrinsics, intrinsics in zip(depth, views.extrinsics, views.intrinsics, strict=True):
+        pixel, z, inside = seen_from(points, surface.shape, extrinsics, intrinsics)
+        seen |= inside & (np.abs(surface.ravel()[pixel] - z) < SAME_SURFACE * z)
     return seen

@@ -74,6 +74,9 @@ class Evaluator:
         """
         given = case.context
         prediction = self.runner.predict_arrays(given.images, given.extrinsics, given.intrinsics, case.near, case.far)
+        exact = None
+        if self.compare and case.depth is not None and (case.depth > 0).all():
+            exact = splats_at(case.depth, given)
         targets = []
         for view, name in enumerate(case.targets.names):
             truth, valid = case.targets.picture(view), case.targets.valid[view]
@@ -81,7 +84,7 @@ class Evaluator:
             pictures: dict[str, np.ndarray] = {MODEL: drawn.rgb}
             details: dict[str, Any] = {}
             if self.compare:
-                others, details = self._others(case, view)
+                others, details = self._others(case, view, exact)
                 pictures |= others
             seen = None if case.seen is None else case.seen[view] & valid
             scores = {method: self._measure(picture, truth, valid, seen) for method, picture in pictures.items()}
@@ -91,15 +94,15 @@ class Evaluator:
         depth = {} if case.depth is None else depth_measures(prediction.depth, case.depth)
         return Result(case.name, given.names, case.near, case.far, targets, depth)
 
-    def _others(self, case: Case, view: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Other methods' pictures of a target, [height, width, 3], and what they found."""
+    def _others(self, case: Case, view: int, exact: Gaussians | None) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Other methods' pictures of a target, [height, width, 3], and what they found; exact: splats at true depth."""
         context, targets, pose = case.context, case.targets, case.targets.extrinsics[view]
         copied = nearest_view(context, pose)
         truth, valid = targets.picture(view), targets.valid[view]
         plane, depth = best_plane(context, truth, valid, pose, targets.K(view), case.near, case.far)
         pictures = {NEAREST: context.picture(copied), PLANE: plane}
-        if case.depth is not None and (case.depth > 0).all():
-            pictures[TRUE_DEPTH] = draw(splats_at(case.depth, context), targets, view, self.nearest_drawn).rgb
+        if exact is not None:
+            pictures[TRUE_DEPTH] = draw(exact, targets, view, self.nearest_drawn).rgb
         return pictures, {"nearest_view": context.names[copied], "plane_depth": depth}
 
     def _measure(
