@@ -28,6 +28,7 @@ from idesplat.model.config import (
 from idesplat.model.idesplat import IDESplat
 from idesplat.runtime.errors import EXIT_STATUS, InputError
 from idesplat.tools import losses, train
+from idesplat.tools.baselines import SPLAT_PIXELS
 from idesplat.tools.curriculum import Objective, Phase, curriculum, phase_at, rate_at
 from idesplat.tools.initialisation import new_model
 from idesplat.tools.train import CHECKPOINT, CURVES, LOG, PICTURES, Run, Settings
@@ -96,17 +97,22 @@ def test_entropy_by_hand() -> None:
     assert losses.entropy_loss(probability, candidates, torch.full((1, 1, 1, 1), 2.5)) == 0  # outside of the candidates
 
 
-def test_opaque_splats_of_the_wanted_size_cost_nothing() -> None:
-    depth = torch.tensor([[[1.0, 2.0], [4.0, 8.0]]])
-    intrinsics = torch.tensor([[[0.5, 0, 0.5], [0, 0.5, 0.5], [0, 0, 1]]])
-    # With a focal length of half the width of two pixels, a pixel is as large as its depth.
-    wanted = losses.SPLAT_PIXELS * depth.reshape(-1, 1).expand(-1, 3)
-    opaque, half = torch.ones(4), torch.full((4,), 0.5)
-    assert float(losses.splat_loss(wanted, opaque, depth, intrinsics)) == pytest.approx(0, abs=1e-7)
-    found = losses.splat_loss(wanted * math.e, opaque, depth, intrinsics)
-    assert float(found) == pytest.approx(losses.SIZE_SHARE, rel=1e-5)
-    found = losses.splat_loss(wanted, half, depth, intrinsics)
-    assert float(found) == pytest.approx(losses.OPACITY_SHARE * math.log(2), rel=1e-5)
+def test_splats_of_the_rule_cost_nothing() -> None:
+    def cost(opacity: float = 20.0, offset: float = 0.0, scale: float = SPLAT_PIXELS, sh: float = 0.0) -> float:
+        raw = torch.zeros(2, 22, 3, 4)  # spherical harmonics of degree 1
+        raw[:, 0] = opacity
+        raw[:, 1] = offset
+        raw[:, 3:6] = 4 + math.log(math.expm1(scale))
+        raw[:, 6:10] = 7.0  # rotation
+        raw[:, [10, 14, 18]] = sh
+        raw[:, [11, 15, 19]] = 3.0  # what depends on the direction
+        return float(losses.splat_loss(raw))
+
+    assert cost() == pytest.approx(0, abs=1e-7)
+    assert cost(opacity=0.0) == pytest.approx(losses.OPACITY_SHARE * math.log(2), rel=1e-5)
+    assert cost(scale=SPLAT_PIXELS * math.e) == pytest.approx(losses.SIZE_SHARE, rel=1e-5)
+    assert cost(offset=math.log(3)) == pytest.approx(losses.OFFSET_SHARE * 0.25 / 2, rel=1e-5)  # of x alone
+    assert cost(sh=-2.0) == pytest.approx(losses.COLOUR_SHARE * 2 * math.sqrt(1 / (4 * math.pi)), rel=1e-5)
 
 
 def test_monocular_loss_knows_no_scale() -> None:

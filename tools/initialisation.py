@@ -16,7 +16,7 @@ from ..model.gaussian_adapter import SCALE_SHIFT
 from ..model.idesplat import IDESplat
 from ..model.mv_transformer import TransformerBlock, WindowAttention
 from ..model.unet import CostRegulariser, ResBlock
-from .losses import SPLAT_PIXELS
+from .baselines import SPLAT_PIXELS
 
 # By how much a correlation of one deviation raises a candidate's logit, about.
 TEMPERATURE = 2.0

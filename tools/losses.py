@@ -1,5 +1,6 @@
 """What training asks of each stage: inverse depth, its gradients and probabilities, and rendered novel views."""
 
+import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +12,10 @@ from torch import Tensor
 from ..model.config import IDESplatConfig
 from ..model.dpbu import Boosted
 from ..model.encoder import Encoded
+from ..model.gaussian_adapter import SCALE_SHIFT, SH_C0
+from ..model.gaussian_head import BASE_PARAMETERS
 from ..model.layers import repeat_views
+from .baselines import SPLAT_PIXELS
 
 # Shares of the terms of one stage's loss.
 FIRST_LAYER_SHARE = 0.5
@@ -24,11 +28,14 @@ MONOCULAR_SHARE = 0.3
 # inverse depth, and in candidates of the coarsest unit.
 LARGE_RELATIVE = 0.5
 LARGE_BINS = 8.0
-# Splats are asked to be about this many pixels large (their standard deviation) and opaque. Views alone settle the size
-# slowly, and answer wrong depth with splats that are half transparent, so that black shows through everywhere.
-SPLAT_PIXELS = 0.5
+# The head of a new network is held to a rule: a splat in the middle of its pixel, of its colour, opaque, and
+# `SPLAT_PIXELS` large. Drawn views alone settle that slowly, and teach what does not carry over: to answer wrong depth
+# with splats half transparent, so that black shows through everywhere; to shift splats downwards, because floors come
+# nearer downwards and the nearer of two neighbours hides the other.
 SIZE_SHARE = 0.03
 OPACITY_SHARE = 0.1
+OFFSET_SHARE = 0.05
+COLOUR_SHARE = 0.1
 # The share of LPIPS beside the squared error (the papers' lambda).
 LPIPS_SHARE = 0.05
 # The file that torchvision keeps VGG16's weights in, on which LPIPS rests.
@@ -123,16 +130,18 @@ def photometric_loss(rendered: Tensor, truth: Tensor, perceptual: Perceptual | N
     return loss if perceptual is None else loss + LPIPS_SHARE * perceptual(rendered, truth)
 
 
-def splat_loss(scales: Tensor, opacities: Tensor, depth: Tensor, intrinsics: Tensor) -> Tensor:
-    """How far the splats are from the size of the pixels they stand for, and from opaque, in logarithms.
+def splat_loss(raw: Tensor) -> Tensor:
+    """How far a network's splats are from those of the rule, where it predicts their scales in pixels.
 
-    scales: [views * H * W, 3] scene units. opacities: [views * H * W]. depth: [views, H, W]. intrinsics: normalised,
-    [views, 3, 3].
+    raw: what GaussianAdapter is given, [views, parameters, H, W].
     """
-    pixel = depth / (intrinsics[:, 0, 0] * depth.shape[2])[:, None, None]  # scene units
-    wanted = (SPLAT_PIXELS * pixel).detach().reshape(-1, 1)
-    size = (scales.log() - wanted.log()).abs().mean()
-    return SIZE_SHARE * size - OPACITY_SHARE * opacities.clamp(min=TINY).log().mean()
+    opacity, offsets, scales, _, sh = raw.split((1, 2, 3, 4, raw.shape[1] - BASE_PARAMETERS), dim=1)
+    size = (F.softplus(scales - SCALE_SHIFT).log() - math.log(SPLAT_PIXELS)).abs().mean()
+    offset = (offsets.sigmoid() - 0.5).abs().mean()
+    colour = SH_C0 * sh[:, :: sh.shape[1] // 3].abs().mean()  # of each channel the band 0
+    return (
+        SIZE_SHARE * size + OFFSET_SHARE * offset + COLOUR_SHARE * colour - OPACITY_SHARE * F.logsigmoid(opacity).mean()
+    )
 
 
 def load_perceptual() -> Perceptual | None:

@@ -9,7 +9,6 @@ from torch import Tensor, nn
 
 from ..model.dpbu import Boosted, Cameras
 from ..model.encoder import Encoded
-from ..model.gaussian_adapter import WorldGaussians
 from ..model.geometry import invert_rigid, scale_intrinsics
 from ..model.idesplat import IDESplat
 from ..model.layers import resize
@@ -39,8 +38,8 @@ class Outcome:
     units: tuple[Boosted, ...]
     # The best inverse depth there is, [views, 1, h, w]; h and w are the images' once three units ran.
     inverse_depth: Tensor
-    # The Gaussians and novel views, [targets, 3, H, W], where the phase has them.
-    gaussians: WorldGaussians | None = None
+    # Where the phase has Gaussians: their raw parameters [views, parameters, H, W], and novel views [targets, 3, H, W].
+    raw: Tensor | None = None
     rendered: Tensor | None = None
 
 
@@ -60,7 +59,7 @@ def run_phase(model: IDESplat, views: Views, phase: Phase) -> Outcome:
         return Outcome(encoded, units, fused)
     predicted = model.gaussians(views.images, cameras, encoded, units)
     rendered = render_targets(predicted.gaussians, views)
-    return Outcome(encoded, units, 1 / predicted.depth[:, None], predicted.gaussians, rendered)
+    return Outcome(encoded, units, 1 / predicted.depth[:, None], predicted.raw, rendered)
 
 
 def render_targets(gaussians: tuple[Tensor, ...], views: Views) -> Tensor:
@@ -109,9 +108,9 @@ def scene_loss(
             loss = loss + unit_loss(unit, of_layers, views.inverse_depth, bins)
         if phase.units == 3:
             loss = loss + inverse_depth_loss(outcome.inverse_depth, views.inverse_depth[:, None], bins)
-    if outcome.rendered is not None and outcome.gaussians is not None:
-        scales, opacities = outcome.gaussians.scales, outcome.gaussians.opacities
-        loss = loss + splat_loss(scales, opacities, 1 / outcome.inverse_depth[:, 0], views.intrinsics)
+    if outcome.raw is not None and model.config.scale_in_pixels:
+        loss = loss + splat_loss(outcome.raw)
+    if outcome.rendered is not None:
         loss = loss + PHOTOMETRIC_SHARE * photometric_loss(outcome.rendered, views.target_images, perceptual)
     return loss, {"loss": float(loss.detach()), **entry}
 
