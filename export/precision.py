@@ -20,7 +20,7 @@ from .stages import names_read
 FLOAT32, INT8, FP16 = PRECISIONS = ("float32", "int8", "fp16")
 # By the names of the networks' parts, which name the nodes.
 TRANSFORMERS = re.compile(r"/encoder/(vit/blocks\.|transformer/)")
-CONVOLUTIONS = re.compile(r"/(encoder|depth|dpbu\d)/|/gaussians/(residual|upsampler)/")
+CONVOLUTIONS = re.compile(r"/(encoder|depth|dpbu\d)/|/gaussians/(residual/|upsampler/|regressor2/)")
 # Fewer products than this for an output are quicker in float32 than to quantise.
 FEW_TERMS = 64
 LARGEST_BYTE, LARGEST_WEIGHT, LARGEST_BIAS = 255, 127, 1 << 30

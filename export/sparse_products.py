@@ -8,6 +8,7 @@ whose steps read a tensor from around it, as the table is.)
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import onnx.inliner
@@ -21,15 +22,15 @@ from ..model.sparse_products import SparseProducts, correlate, weigh
 FEW = 256
 # While a network is traced each product is one node of this domain; these functions say what it does.
 DOMAIN = "idesplat"
-# A step takes 16 pixels. Every map has a multiple of them, since its sides are multiples of 4; more leave the cache.
 # What both products share: rows [pairs, candidates, h * w], table [rows, channels] and `by_pixel` [pairs, h * w, ...]
-# -> products [steps, 16, ...], of a step's pixels, each of `shape`, with the rows that they gather.
+# -> products [steps, step, ...], of a step's pixels, each of `shape`, with the rows that they gather. A step takes a
+# block: 16 pixels in the coarsest maps, where they gather most, 256 in the finest.
 STEPS = """
         candidates = Shape <start = 1, end = 2> (rows)
         pixels = Shape <start = 2, end = 3> (rows)
         channels = Shape <start = 1, end = 2> (table)
         all = Constant <value_ints = [-1]> ()
-        step = Constant <value_ints = [-1, 16]> ()
+        step = Constant <value_ints: ints = @step> ()
         one = Constant <value_ints = [1]> ()
         rows_shape = Concat <axis = 0> (step, candidates)
         rows_by_pixel = Transpose <perm = [0, 2, 1]> (rows)
@@ -47,13 +48,13 @@ STEPS = """
             product = MatMul ({product})
         }}> (steps, go)
 """
-CORRELATE = """correlate (queries, table, rows) => (scores) {{
+CORRELATE = """correlate <step> (queries, table, rows) => (scores) {{
         {steps}
         scores_shape = Concat <axis = 0> (all, pixels, candidates)
         scores_by_pixel = Reshape (products, scores_shape)
         scores = Transpose <perm = [0, 2, 1]> (scores_by_pixel)
     }}""".format(steps=STEPS.format(shape="channels, one", by_pixel="queries", product="gathered, some"))
-WEIGH = """weigh (probability, table, rows) => (sums) {{
+WEIGH = """weigh <step> (probability, table, rows) => (sums) {{
         weights = Transpose <perm = [0, 2, 1]> (probability)
         {steps}
         sums_shape = Concat <axis = 0> (all, pixels, channels)
@@ -67,7 +68,8 @@ def in_steps(network: nn.Module) -> Iterator[None]:
     """Have a network's sparse products traced as nodes that `explain` explains."""
     parts = [part for part in network.modules() if isinstance(part, SparseProducts) and part.gathers >= FEW]
     for part in parts:
-        part.correlate, part.weigh = _Correlate.apply, _Weigh.apply
+        part.correlate = partial(_Correlate.apply, part.block)
+        part.weigh = partial(_Weigh.apply, part.block)
     try:
         yield
     finally:
@@ -100,21 +102,23 @@ class _Correlate(torch.autograd.Function):
     """`correlate`, traced as one node."""
 
     @staticmethod
-    def forward(ctx: Any, queries: Tensor, table: Tensor, rows: Tensor) -> Tensor:
+    def forward(ctx: Any, step: int, queries: Tensor, table: Tensor, rows: Tensor) -> Tensor:
         return correlate(queries, table, rows)
 
     @staticmethod
-    def symbolic(g: Any, queries: Any, table: Any, rows: Any) -> Any:
-        return g.op(f"{DOMAIN}::correlate", queries, table, rows).setType(queries.type().with_sizes([None] * 3))
+    def symbolic(g: Any, step: int, queries: Any, table: Any, rows: Any) -> Any:
+        node = g.op(f"{DOMAIN}::correlate", queries, table, rows, step_i=[-1, step])
+        return node.setType(queries.type().with_sizes([None] * 3))
 
 
 class _Weigh(torch.autograd.Function):
     """`weigh`, traced as one node."""
 
     @staticmethod
-    def forward(ctx: Any, probability: Tensor, table: Tensor, rows: Tensor) -> Tensor:
+    def forward(ctx: Any, step: int, probability: Tensor, table: Tensor, rows: Tensor) -> Tensor:
         return weigh(probability, table, rows)
 
     @staticmethod
-    def symbolic(g: Any, probability: Any, table: Any, rows: Any) -> Any:
-        return g.op(f"{DOMAIN}::weigh", probability, table, rows).setType(table.type().with_sizes([None] * 3))
+    def symbolic(g: Any, step: int, probability: Any, table: Any, rows: Any) -> Any:
+        node = g.op(f"{DOMAIN}::weigh", probability, table, rows, step_i=[-1, step])
+        return node.setType(table.type().with_sizes([None] * 3))

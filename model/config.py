@@ -37,6 +37,11 @@ class UNetConfig:
     levels: int
     heads: int = 4
 
+    @property
+    def side(self) -> int:
+        """Height and width of its maps must be multiples of this, to halve evenly."""
+        return 2 ** (self.levels - 1)
+
 
 @dataclass(frozen=True)
 class DPBUConfig:
@@ -142,7 +147,7 @@ class IDESplatConfig(EncoderConfig):
     @property
     def size_multiple(self) -> int:
         """Height and width must be multiples of this: every U-Net and the attention windows halve evenly."""
-        return max(self.feature_stride // unit.scale * 2 ** (unit.unet.levels - 1) for unit in self.dpbus)
+        return max(self.feature_stride // unit.scale * unit.unet.side for unit in self.dpbus)
 
 
 @dataclass(frozen=True)
@@ -167,8 +172,7 @@ class DepthSplatConfig(EncoderConfig):
     @property
     def size_multiple(self) -> int:
         """Height and width must be multiples of this: every U-Net and the attention windows halve evenly."""
-        levels = (scale.unet.levels - 1 - index for index, scale in enumerate(self.scales))
-        return self.feature_stride * 2 ** max(levels)
+        return max(self.feature_stride // 2**index * scale.unet.side for index, scale in enumerate(self.scales))
 
 
 TWO_SCALES = (

@@ -22,7 +22,7 @@ class EpipolarAttention(nn.Module):
         super().__init__()
         channels, candidates = config.channels, config.candidates
         self.scale = channels**-0.5
-        self.products = SparseProducts(channels * candidates)
+        self.products = SparseProducts(channels * candidates, config.unet.side**2)
         # Position embeddings of the candidates, for keys, values and scores.
         self.key_position = nn.Parameter(torch.zeros(candidates))
         self.value_position = nn.Parameter(torch.zeros(candidates))

@@ -16,10 +16,10 @@ CHUNK = 8
 class SparseProducts(nn.Module):
     """The two products as a part of a network, where training on a CPU and the export put others in their place."""
 
-    def __init__(self, gathers: int) -> None:
-        """`gathers`: the numbers that a pixel gathers for one product."""
+    def __init__(self, gathers: int, block: int) -> None:
+        """gathers: the numbers that a pixel gathers for a product. block: pixels that every map has a multiple of."""
         super().__init__()
-        self.gathers = gathers
+        self.gathers, self.block = gathers, block
         self.correlate, self.weigh = correlate, weigh
 
 

@@ -147,7 +147,7 @@ def test_depth_only_network_gives_the_same_depth():
         torch.testing.assert_close(alone(*inputs).depth, whole(*inputs).depth)
 
 
-@pytest.mark.parametrize("form", (by_sampling, partial(by_gathering, products=SparseProducts(0))))
+@pytest.mark.parametrize("form", (by_sampling, partial(by_gathering, products=SparseProducts(0, 1))))
 def test_every_form_of_the_cost_volume_is_grid_sample_then_correlation(form):
     """Borders included, with cameras that turn away and candidates that fall far outside."""
     count, channels, height, width = 4, 6, 9, 13

@@ -13,7 +13,7 @@ from idesplat.runtime.bundle import INPUTS, OUTPUTS
 from onnx import TensorProto
 
 # What is not to lose precision: the geometry, the sparse products, what makes Gaussians of features.
-EXACT = re.compile(r"/(correlate|weigh)/|/gaussians/(adapter|focus|head|regressor|expand|fuse)")
+EXACT = re.compile(r"/(correlate|weigh)/|/gaussians/(adapter|focus|head|regressor1|expand|fuse)")
 
 
 @pytest.fixture(scope="module", params=["int8", "fp16"])

@@ -5,12 +5,19 @@ python -m idesplat.tools.bench_products
 
 import tempfile
 import warnings
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
 import numpy as np
+import onnx
+import onnxruntime
+import torch
 import typer
+from torch import Tensor, nn
 
+from ..export.sparse_products import FEW, explain, in_steps
+from ..model.sparse_products import SparseProducts
 from .bench import thread_environment
 from .bench_parts import race
 from .bench_worker import Prepared
@@ -20,22 +27,26 @@ INPUTS = ("queries", "table", "rows")
 
 
 class Shape(NamedTuple):
-    """What one product works on: square maps, candidates of a pixel, channels of a row, pixels the candidates span."""
+    """What one product works on: square maps, candidates of a pixel, channels of a row, pixels the candidates span.
+
+    block: of so many pixels every map has a multiple.
+    """
 
     side: int
     candidates: int
     channels: int
     span: float
+    block: int
 
 
 SHAPES = {
-    "IDESplat, unit 1": Shape(64, 257, 256, 21),
-    "IDESplat, unit 2": Shape(128, 129, 64, 4),
-    "IDESplat, unit 3": Shape(256, 65, 32, 4),
-    "DepthSplat, four pixels a candidate": Shape(64, 512, 128, 21),
-    "idesplat-tiny, unit 1": Shape(64, 97, 64, 21),
-    "idesplat-tiny, unit 2": Shape(128, 25, 32, 4),
-    "idesplat-tiny, unit 3": Shape(256, 9, 8, 4),
+    "IDESplat, unit 1": Shape(64, 257, 256, 21, 16),
+    "IDESplat, unit 2": Shape(128, 129, 64, 4, 64),
+    "IDESplat, unit 3": Shape(256, 65, 32, 4, 256),
+    "DepthSplat, four pixels a candidate": Shape(64, 512, 128, 21, 16),
+    "idesplat-tiny, unit 1": Shape(64, 97, 64, 21, 16),
+    "idesplat-tiny, unit 2": Shape(128, 25, 32, 4, 64),
+    "idesplat-tiny, unit 3": Shape(256, 9, 8, 4, 256),
 }
 
 
@@ -54,40 +65,45 @@ def main(
 
 
 def products(shape: Shape, steps: bool, threads: int) -> Prepared:
-    """Both products, one after the other, as an exported graph has them."""
-    import onnx
-    import onnxruntime
-    import torch
-    from torch import Tensor, nn
-
-    from ..export.sparse_products import FEW, explain, in_steps
-    from ..model.sparse_products import SparseProducts
-
-    class Both(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.products = SparseProducts(FEW if steps else 0)
-
-        def forward(self, queries: Tensor, table: Tensor, rows: Tensor) -> Tensor:
-            return self.products.weigh(self.products.correlate(queries, table, rows), table, rows)
-
+    """Both products, one after the other, as an exported graph has them or gathered at once."""
     arrays = example(shape)
-    network = Both()
-    with tempfile.TemporaryDirectory() as folder, in_steps(network), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # deprecation of the path, and tracing warnings
-        path = Path(folder) / "both.onnx"
-        tensors = tuple(torch.from_numpy(array) for array in arrays)
-        torch.onnx.export(network, tensors, str(path), dynamo=False, opset_version=20, input_names=list(INPUTS))
-        model = explain(onnx.load(path))
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
-    session = onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
+    graph = exported(shape.block, arrays, steps).SerializeToString()
+    session = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
     feed = dict(zip(INPUTS, arrays, strict=True))
 
     def run() -> None:
         session.run(None, feed)
 
     return None, run
+
+
+class Both(nn.Module):
+    """One product after the other."""
+
+    def __init__(self, block: int) -> None:
+        super().__init__()
+        self.products = SparseProducts(FEW, block)
+
+    def forward(self, queries: Tensor, table: Tensor, rows: Tensor) -> Tensor:
+        """As `SparseProducts`: the rows weighed by their scores, [pairs, h * w, channels]."""
+        return self.products.weigh(self.products.correlate(queries, table, rows), table, rows)
+
+
+def exported(block: int, arrays: tuple[np.ndarray, ...], steps: bool) -> onnx.ModelProto:
+    """`Both` as a graph whose pairs and pixels are open."""
+    network = Both(block)
+    axes = {"queries": {0: "pairs", 1: "pixels"}, "table": {0: "all"}, "rows": {0: "pairs", 2: "pixels"}}
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # deprecation of the path, and tracing warnings
+        path = Path(folder) / "both.onnx"
+        tensors = tuple(torch.from_numpy(array) for array in arrays)
+        with in_steps(network) if steps else nullcontext():
+            torch.onnx.export(
+                network, tensors, str(path), dynamo=False, opset_version=20, input_names=list(axes), dynamic_axes=axes
+            )
+        return explain(onnx.load(path))
 
 
 def example(shape: Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
