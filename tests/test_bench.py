@@ -81,24 +81,29 @@ def test_flop_of_operators_worked_by_hand(tmp_path):
         helper.make_node("ConvTranspose", ["a", "v"], ["b"], strides=[2, 2]),
         helper.make_node("MatMul", ["b", "m"], ["c"]),
         helper.make_node("Flatten", ["c"], ["d"], axis=2),
-        helper.make_node("Gemm", ["d", "g"], ["y"], transA=1, transB=1),
+        helper.make_node("Gemm", ["d", "g"], ["e"], transA=1, transB=1),
+        helper.make_node("DynamicQuantizeLinear", ["e"], ["f", "step", "zero"]),
+        helper.make_node("MatMulInteger", ["f", "i", "zero"], ["y"]),
     ]
     weights = [weight("w", 6, 2, 3, 3), weight("v", 6, 5, 2, 2), weight("m", 12, 7), weight("g", 9, 5)]
+    weights.append(numpy_helper.from_array(np.ones((9, 4), np.int8), "i"))
     given = helper.make_tensor_value_info("x", TensorProto.FLOAT, [1, 4, 10, 12])
-    result = helper.make_tensor_value_info("y", TensorProto.FLOAT, None)
+    result = helper.make_tensor_value_info("y", TensorProto.INT32, None)
     graph = helper.make_graph(nodes, "graph", [given], [result], weights)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=10)
     session = open_session(model.SerializeToString(), CPU, Tuning(1, tmp_path / "profile", optimise=False))
     (y,) = session.run(None, {"x": rng.normal(size=(1, 4, 10, 12)).astype(np.float32)})
     kernels = last_kernels(Path(session.end_profiling()))
     counted = {kernel["args"]["op_name"]: flop_of(kernel["args"]) for kernel in kernels}
-    assert y.shape == (70, 9)
+    assert y.shape == (70, 4)
     assert counted == {
         "Conv": 2 * (6 * 5 * 6) * (2 * 3 * 3),
         "ConvTranspose": 2 * (6 * 5 * 6) * (5 * 2 * 2),
         "MatMul": 2 * (5 * 10 * 7) * 12,
         "Flatten": 0,
         "Gemm": 2 * (70 * 9) * 5,
+        "DynamicQuantizeLinear": 0,
+        "MatMulInteger": 2 * (70 * 4) * 9,
     }
 
 

@@ -24,6 +24,8 @@ TIMES_PROFILED = 2
 NODE_SUFFIX = "_kernel_time"
 # Operators whose time is that of others inside them.
 LOOPS = ("Scan", "Loop", "If")
+# Operators whose FLOP are counted, as a graph has them before it is optimised.
+PRODUCTS = ("MatMul", "MatMulInteger", "Gemm", "Conv", "ConvTranspose")
 RUN = "run"
 
 
@@ -247,7 +249,7 @@ def last_kernels(profile: Path) -> list[dict[str, Any]]:
 def flop_of(args: dict[str, Any]) -> int:
     """Floating-point operations of one operator, from the shapes in ONNX Runtime's notes."""
     operator = args["op_name"]
-    if operator not in ("MatMul", "Gemm", "Conv", "ConvTranspose"):
+    if operator not in PRODUCTS:
         return 0
     first, second = (next(iter(entry.values())) for entry in args["input_type_shape"][:2])
     result = next(iter(args["output_type_shape"][0].values()))
@@ -255,7 +257,7 @@ def flop_of(args: dict[str, Any]) -> int:
         return 2 * prod(result) * prod(second[1:])
     if operator == "ConvTranspose":
         return 2 * prod(first) * prod(second[1:])
-    terms = first[-1] if operator == "MatMul" else prod(first) // result[0]
+    terms = prod(first) // result[0] if operator == "Gemm" else first[-1]
     return 2 * prod(result) * terms
 
 
