@@ -12,8 +12,10 @@ from idesplat.runtime import Runner
 from idesplat.runtime.bundle import INPUTS, OUTPUTS
 from onnx import TensorProto
 
-# What is not to lose precision: the geometry, the sparse products, what makes Gaussians of features.
-EXACT = re.compile(r"/(correlate|weigh)/|/gaussians/(adapter|focus|head|regressor1|expand|fuse)")
+# What is not to lose precision: the geometry, monocular depth, the sparse products, what makes Gaussians of features.
+EXACT = re.compile(
+    r"/(correlate|weigh)/|/gaussians/(adapter|focus|head|regressor1|expand|fuse)|/encoder/(disparity|fusions|laterals)"
+)
 
 
 @pytest.fixture(scope="module", params=["int8", "fp16"])

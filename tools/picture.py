@@ -18,7 +18,7 @@ from ..runtime.runner import Runner
 from ..runtime.views import prepare
 
 # Two photographs, and one between them that the model is not given.
-CONTEXT, BETWEEN = (2, 4), 3
+CONTEXT, BETWEEN = (1, 3), 2
 
 
 @exit_on_input_error
