@@ -23,7 +23,9 @@ from .bench_parts import race
 from .bench_worker import Prepared
 
 PAIRS = 2
-INPUTS = ("queries", "table", "rows")
+# The inputs, and which of their axes are open.
+AXES = {"queries": {0: "pairs", 1: "pixels"}, "table": {0: "all"}, "rows": {0: "pairs", 2: "pixels"}}
+INPUTS = tuple(AXES)
 
 
 class Shape(NamedTuple):
@@ -94,14 +96,13 @@ class Both(nn.Module):
 def exported(block: int, arrays: tuple[np.ndarray, ...], steps: bool) -> onnx.ModelProto:
     """`Both` as a graph whose pairs and pixels are open."""
     network = Both(block)
-    axes = {"queries": {0: "pairs", 1: "pixels"}, "table": {0: "all"}, "rows": {0: "pairs", 2: "pixels"}}
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # deprecation of the path, and tracing warnings
         path = Path(folder) / "both.onnx"
         tensors = tuple(torch.from_numpy(array) for array in arrays)
         with in_steps(network) if steps else nullcontext():
             torch.onnx.export(
-                network, tensors, str(path), dynamo=False, opset_version=20, input_names=list(axes), dynamic_axes=axes
+                network, tensors, str(path), dynamo=False, opset_version=20, input_names=list(INPUTS), dynamic_axes=AXES
             )
         return explain(onnx.load(path))
 

@@ -5,7 +5,6 @@ python -m idesplat.tools.bfloat16 [MODEL]
 What a processor does that multiplies in bfloat16 and adds in float32 is done by hand: operands are rounded before.
 """
 
-import re
 from pathlib import Path
 from typing import Annotated
 
@@ -65,7 +64,8 @@ def _rounded(graph: onnx.ModelProto, part: str, weighted: bool) -> onnx.ModelPro
     nodes: list[onnx.NodeProto] = []
     rounded: set[str] = set()
     for node in copy.graph.node:
-        if node.op_type in PRODUCTS and re.match(f"/{part}/", node.name) and (not weighted or node.input[1] in weights):
+        inside = node.op_type in PRODUCTS and node.name.startswith(f"/{part}/")
+        if inside and (not weighted or node.input[1] in weights):
             for index, name in enumerate(node.input[:2]):
                 if name not in rounded:
                     nodes += _rounding(name)
