@@ -91,18 +91,22 @@ def prepare(pairs: Sequence[Pair], count: int | None, height: int, width: int) -
         pairs, choice = choose_pairs(pairs, count)
     extrinsics = np.stack([camera.extrinsics for _, camera in pairs])  # [views, 4, 4]
     _check_distinct(extrinsics, [camera.name for _, camera in pairs])
-    cameras, images, intrinsics = [], [], []
-    for picture, camera in pairs:
-        image = picture if isinstance(picture, np.ndarray) else load_image(picture)
-        with located(camera.name):
-            camera = resized(camera, image.shape[1], image.shape[0])
-        image, camera = undistort(image, camera)
-        pixels, normalised = fit(image, camera.K, height, width)
-        cameras.append(camera)
-        images.append(pixels)
-        intrinsics.append(normalised)
     names = [_path(camera.name).name for _, camera in pairs]
-    return Views(names, np.stack(images), extrinsics, np.stack(intrinsics), cameras, choice)
+    images, intrinsics, cameras = zip(*(take(pair, height, width) for pair in pairs), strict=True)
+    return Views(names, np.stack(images), extrinsics, np.stack(intrinsics), list(cameras), choice)
+
+
+def take(pair: Pair, height: int, width: int) -> tuple[np.ndarray, np.ndarray, Camera]:
+    """One picture, undistorted, [3, height, width] in [0, 1]; its normalised intrinsics [3, 3]; its ideal camera.
+
+    Raises InputError where it cannot be read or has another size than its camera.
+    """
+    picture, camera = pair
+    image = picture if isinstance(picture, np.ndarray) else load_image(picture)
+    with located(camera.name):
+        camera = resized(camera, image.shape[1], image.shape[0])
+    image, camera = undistort(image, camera)
+    return *fit(image, camera.K, height, width), camera
 
 
 def choose_pairs(pairs: Sequence[Pair], count: int) -> tuple[list[Pair], str]:

@@ -112,6 +112,19 @@ def test_same_seed_same_sample_other_seed_another() -> None:
     assert np.abs(first.intrinsics - other.intrinsics).max() > 0.01
 
 
+def test_target_drawn_closer_is_a_window_of_the_larger_picture() -> None:
+    """Context and cameras stay; every pixel of the window shows what the large picture shows there."""
+    plain, closer = (draw_sample(7, 2, 2, 64, 96, closer=times) for times in ((), (1, 3)))
+    large = draw_sample(7, 2, 2, 3 * 64, 3 * 96)
+    assert np.array_equal(plain.extrinsics[:, :3, :3], closer.extrinsics[:, :3, :3])
+    assert np.array_equal(plain.intrinsics[:3], closer.intrinsics[:3])
+    corner = 3 * plain.intrinsics[3, :2, 2] - closer.intrinsics[3, :2, 2]  # in windows
+    assert (corner >= 0).all() and (corner <= 2).all() and corner.max() > 0
+    left, top = (corner * (96, 64)).round().astype(int)
+    shown = large.depth[3, top : top + 64, left : left + 96] / large.depth[0].min()
+    assert np.median(np.abs(closer.depth[3] / closer.depth[0].min() / shown - 1)) < 0.01
+
+
 def test_samples_are_well_formed() -> None:
     samples = [draw_sample(seed, 2, 2, 24, 32) for seed in (*range(60), *HELD_OUT_SEEDS[:4])]
     for sample in samples:

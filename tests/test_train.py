@@ -175,8 +175,8 @@ def test_curriculum_and_rates() -> None:
 
 
 def test_scenes_come_in_order_and_repeat() -> None:
-    orders = [training_order(5, step, 0, 1, 32, 32, many=True) for step in range(120)]
-    assert orders == [training_order(5, step, 0, 1, 32, 32, many=True) for step in range(120)]
+    orders = [training_order(5, step, 0, True, 32, 32, many=True) for step in range(120)]
+    assert orders == [training_order(5, step, 0, True, 32, 32, many=True) for step in range(120)]
     assert len({order.seed for order in orders}) == 120 and {order.context for order in orders} == {2, 3}
     drawn = list(drawn_ahead(iter(orders[:7])))
     for order, views in zip(orders, drawn, strict=False):
@@ -189,7 +189,7 @@ def test_scenes_come_in_order_and_repeat() -> None:
 def test_a_few_steps_on_one_scene_learn(objective: Objective) -> None:
     """Depth and novel views each get better where they are asked for."""
     state = TrainingState(SMALL, seed=0, lr=3e-3, vit_lr=3e-3)
-    views = next(drawn_ahead(iter([Order(11, 2, 1, 64, 64)])))
+    views = next(drawn_ahead(iter([Order(11, 2, (1,), 64, 64)])))
     phase = curriculum(objective, gradual=False)[0]
     entries = []
     for _ in range(14):
@@ -347,14 +347,21 @@ def test_photographs_are_trained_on_by_their_views_alone(scene: Path, tmp_path: 
 
 def test_folders_are_drawn_from_as_ordered(scene: Path) -> None:
     scenes = FolderScenes([scene], near=1, far=20)
-    order = Order(5, 2, 1, 64, 96)
+    order = Order(5, 2, (1,), 64, 96)
     first, again = scenes.draw(order), scenes.draw(order)
     assert torch.equal(first.images, again.images) and torch.equal(first.target_images, again.target_images)
     assert first.images.shape == (2, 3, 64, 96) and first.target_images.shape == (1, 3, 64, 96)
     places = torch.cat([first.extrinsics, first.target_extrinsics])[:, :3, 3]
     assert len(places.unique(dim=0)) == 3
+    closer = scenes.draw(replace(order, closer=(2,)))
+    corner = (2 * first.target_intrinsics[0, :2, 2] - closer.target_intrinsics[0, :2, 2]).numpy()  # in windows
+    left, top = (corner * (96, 64)).round().astype(int)
+    shown = first.target_images[0].repeat_interleave(2, 1).repeat_interleave(2, 2)
+    shown = shown[:, top : top + 64, left : left + 96]
+    assert torch.equal(first.images, closer.images) and (left > 0 or top > 0)
+    assert (closer.target_images[0] - shown).abs().mean() < 0.05
     with pytest.raises(InputError, match="5 photographs, expected at least 6"):
-        scenes.draw(Order(5, 4, 2, 64, 96))
+        scenes.draw(Order(5, 4, (1, 2), 64, 96))
 
 
 def test_folder_without_a_photograph_is_refused(scene: Path, tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Training and evaluation samples drawn from a seed: photographs of procedural scenes with exact depth and cameras."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -50,10 +51,13 @@ def scene_textures(seed: int) -> Textures:
     return texture_bank(1, 260) if seed in TRAINING_SEEDS else texture_bank(2, 104)
 
 
-def draw_sample(seed: int, context: int, targets: int, height: int, width: int, samples: int = 4) -> Sample:
+def draw_sample(
+    seed: int, context: int, targets: int, height: int, width: int, samples: int = 4, closer: Sequence[int] = ()
+) -> Sample:
     """The sample of `seed`: `context` views whose neighbours overlap, and `targets` views between and around them.
 
-    The same seed, counts and size give the same sample. samples: rays for a pixel's colour.
+    The same arguments give the same sample. samples: rays for a pixel's colour. closer: how many times as large as the
+    context each target is drawn, of which the picture is then a window somewhere; if empty, all are as large.
     The first call in a process draws the textures (some seconds).
     """
     rng = np.random.default_rng(seed)
@@ -61,6 +65,8 @@ def draw_sample(seed: int, context: int, targets: int, height: int, width: int, 
     layout = draw_layout(rng, bank)
     intrinsics = _draw_intrinsics(rng, context + targets, width / height)
     extrinsics = _draw_cameras(rng, layout, intrinsics, context, targets)
+    for view, times in enumerate(closer, start=context):
+        intrinsics[view] = window(intrinsics[view], times, draw_corner(rng, times))
     views = [
         photograph(layout.scene, bank, pose, k, height, width, samples)
         for pose, k in zip(extrinsics, intrinsics, strict=True)
@@ -107,6 +113,16 @@ def look_at(eye: np.ndarray, focus: np.ndarray, roll: float = 0.0) -> np.ndarray
     pose[:3, 2] = forward
     pose[:3, 3] = eye
     return pose
+
+
+def draw_corner(rng: np.random.Generator, closer: int) -> np.ndarray:
+    """The corner (x, y), in windows, of a window of the former size in a picture drawn `closer` times as large."""
+    return rng.uniform(0, closer - 1, 2)
+
+
+def window(intrinsics: np.ndarray, closer: int, corner: np.ndarray) -> np.ndarray:
+    """Normalised intrinsics [3, 3] of a window at `corner` [2], in windows, of a picture `closer` times as large."""
+    return np.diag([closer, closer, 1.0]) @ intrinsics - np.array([[0, 0, corner[0]], [0, 0, corner[1]], [0, 0, 0]])
 
 
 def probe(scene: Scene, pose: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:

@@ -141,7 +141,7 @@ class Run:
             phase = self.phase(step)
             side = self.settings.size // phase.shrink
             for slot in range(self.settings.batch):
-                yield training_order(self.settings.seed, step, slot, int(phase.gaussians), side, side, phase.units > 1)
+                yield training_order(self.settings.seed, step, slot, phase.gaussians, side, side, phase.units > 1)
 
     def one_step(self, scenes: "Iterator[Views]") -> dict[str, Any]:
         """Gather the gradients of a batch and step along them; returns what is logged."""

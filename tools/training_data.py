@@ -13,6 +13,9 @@ from .scenes import TRAINING_SEEDS, Sample, draw_sample
 
 # Share of the scenes with three context views instead of two.
 THREE_VIEW_SHARE = 0.06
+# Novel views are asked for as large as the photographs and, each step, a window of one up to so many times as large:
+# splats that only meet views of their own size leave gaps when a viewer fills a screen with them.
+CLOSEST = 4
 # Scenes drawn ahead of their use.
 AHEAD = 4
 
@@ -34,11 +37,14 @@ class Views:
 
 @dataclass(frozen=True)
 class Order:
-    """One scene as a step wants it."""
+    """One scene as a step wants it.
+
+    closer: for each target how many times as large as the context it is drawn, a window of it.
+    """
 
     seed: int
     context: int
-    targets: int
+    closer: tuple[int, ...]
     height: int
     width: int
 
@@ -64,17 +70,20 @@ def to_views(sample: Sample) -> Views:
 
 def draw_views(order: Order) -> Views:
     """The scene of an order; the same order gives the same scene."""
-    return to_views(draw_sample(order.seed, order.context, order.targets, order.height, order.width))
+    targets = len(order.closer)
+    return to_views(draw_sample(order.seed, order.context, targets, order.height, order.width, closer=order.closer))
 
 
-def training_order(seed: int, step: int, slot: int, targets: int, height: int, width: int, many: bool) -> Order:
+def training_order(seed: int, step: int, slot: int, rendered: bool, height: int, width: int, many: bool) -> Order:
     """The scene at place `slot` of a step's batch, drawn from the run's seed and the step alone.
 
-    many: whether some scenes are to have three context views.
+    rendered: whether it has novel views. many: whether some scenes are to have three context views.
     """
     rng = np.random.default_rng((seed, step, slot))
     context = 3 if many and rng.random() < THREE_VIEW_SHARE else 2
-    return Order(int(rng.integers(TRAINING_SEEDS.start, TRAINING_SEEDS.stop)), context, targets, height, width)
+    scene = int(rng.integers(TRAINING_SEEDS.start, TRAINING_SEEDS.stop))
+    closer = (1, int(rng.integers(2, CLOSEST + 1))) if rendered else ()
+    return Order(scene, context, closer, height, width)
 
 
 def drawn_ahead(orders: Iterator[Order], draw: Callable[[Order], Views] = draw_views) -> Generator[Views]:

@@ -5,13 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ..runtime.cameras import Camera, read_cameras
 from ..runtime.depth_range import find_depth_range
 from ..runtime.errors import InputError
 from ..runtime.scene_frame import SceneFrame
 from ..runtime.views import Views as Photographs
-from ..runtime.views import prepare
+from ..runtime.views import prepare, take
+from .scenes import window
 from .training_data import Order, Views
 
 CAMERAS = "transforms.json"
@@ -38,28 +40,40 @@ class FolderScenes:
         """Context views near each other, and targets near them; raises InputError where a scene is too small."""
         rng = np.random.default_rng(order.seed)
         pairs = self.folders[rng.integers(len(self.folders))]
-        chosen = _choose(rng, pairs, order.context, order.targets)
+        chosen = _choose(rng, pairs, order.context, len(order.closer))
         photographs = prepare([pairs[index] for index in chosen], None, order.height, order.width)
-        return self._to_views(photographs, order.context)
+        targets = [
+            _target(rng, pairs[index], closer, order)
+            for index, closer in zip(chosen[order.context :], order.closer, strict=True)
+        ]
+        return self._to_views(photographs, order.context, targets)
 
-    def _to_views(self, photographs: Photographs, context: int) -> Views:
+    def _to_views(self, photographs: Photographs, context: int, targets: Sequence[tuple[Tensor, Tensor]]) -> Views:
         given = photographs.images, photographs.extrinsics, photographs.intrinsics
         found = find_depth_range(*given, photographs.cameras, self.trained)
         frame = SceneFrame.of(photographs.extrinsics[:context], np.array([found.near]), self.trained[0])
         near, far = (torch.full((context,), depth * frame.scale) for depth in (found.near, found.far))
-        entered = photographs.images, frame.enter(photographs.extrinsics), photographs.intrinsics
-        images, poses, intrinsics = (torch.from_numpy(part) for part in entered)
+        poses = torch.from_numpy(frame.enter(photographs.extrinsics))
         return Views(
-            images[:context],
+            torch.from_numpy(photographs.images[:context]),
             poses[:context],
-            intrinsics[:context],
+            torch.from_numpy(photographs.intrinsics[:context]),
             near,
             far,
             None,
-            images[context:],
+            torch.stack([image for image, _ in targets]),
             poses[context:],
-            intrinsics[context:],
+            torch.stack([intrinsics for _, intrinsics in targets]),
         )
+
+
+def _target(rng: np.random.Generator, pair: tuple[Path, Camera], closer: int, order: Order) -> tuple[Tensor, Tensor]:
+    """A window [3, height, width] of a photograph `closer` times as large as the context, and its intrinsics [3, 3]."""
+    large, intrinsics, _ = take(pair, closer * order.height, closer * order.width)
+    top, left = (int(rng.integers((closer - 1) * side + 1)) for side in (order.height, order.width))
+    image = large[:, top : top + order.height, left : left + order.width].copy()
+    corner = np.array([left / order.width, top / order.height])
+    return torch.from_numpy(image), torch.from_numpy(window(intrinsics, closer, corner).astype(np.float32))
 
 
 def _pairs(folder: Path) -> Pairs:
