@@ -60,12 +60,15 @@ class Case:
 def verify(network: NamedTensors, graphs: Graphs, description: Description, fixed: Fixed) -> Iterator[Parity]:
     """Compare the graphs of every stage, and that of the whole, with the network on two shapes."""
     cases = [_case(network, description, *shape) for shape in _shapes(description, fixed)]
-    for stage in graphs.stages:
-        yield from _verify(
-            graphs.of_stage(stage), stage.name, stage.outputs, cases, STAGE_TOLERANCE[description.precision]
-        )
+    yield from stage_errors(graphs, cases, description.precision)
     results = [name for name in OUTPUTS if name in cases[0].tensors]
     yield from _verify(graphs.whole, WHOLE, results, cases, WHOLE_TOLERANCE[description.precision])
+
+
+def stage_errors(graphs: Graphs, cases: list[Case], precision: str) -> Iterator[Parity]:
+    """Compare the graph of every stage with the network, from whose tensors each of them starts."""
+    for stage in graphs.stages:
+        yield from _verify(graphs.of_stage(stage), stage.name, stage.outputs, cases, STAGE_TOLERANCE[precision])
 
 
 def _shapes(description: Description, fixed: Fixed) -> list[tuple[int, int, int]]:

@@ -18,6 +18,10 @@ SH_DECAY = 0.25
 # The constant value of the spherical harmonic of degree 0.
 SH_C0 = 0.28209479177387814
 QUATERNION_EPSILON = 1e-8
+# What a pixel's raw parameters begin with: opacity logit, offset x y, scales, quaternion xyzw in the camera's frame.
+# The harmonics come behind it.
+BASE_SIZES = (1, 2, 3, 4)
+BASE_PARAMETERS = sum(BASE_SIZES)
 
 
 class WorldGaussians(NamedTuple):
@@ -31,7 +35,7 @@ class WorldGaussians(NamedTuple):
 
 
 class GaussianAdapter(nn.Module):
-    """Raw parameters a pixel: opacity logit, offset x y, scales, quaternion xyzw in the camera's frame, harmonics."""
+    """A pixel's raw parameters, as `BASE_SIZES` orders them, to its Gaussian."""
 
     sh_decay: Tensor
 
@@ -46,7 +50,7 @@ class GaussianAdapter(nn.Module):
 
     def forward(self, raw: Tensor, depth: Tensor, images: Tensor, cameras: Cameras) -> WorldGaussians:
         """raw [views, parameters, H, W], depth [views, H, W], images [views, 3, H, W] in [0, 1] -> Gaussians."""
-        sizes = (1, 2, 3, 4, 3 * self.coefficients)
+        sizes = (*BASE_SIZES, 3 * self.coefficients)
         logits, offsets, scales, rotations, sh = raw.flatten(2).transpose(1, 2).split(sizes, dim=-1)
         means = self._means(offsets.sigmoid(), depth, cameras)
         scales = F.softplus(scales - SCALE_SHIFT).clamp(self.scale_min, self.scale_max)

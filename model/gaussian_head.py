@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from .config import IDESplatConfig
 from .dpbu import Boosted
 from .encoder import Encoded, normalise
-from .gaussian_adapter import GaussianAdapter, WorldGaussians
+from .gaussian_adapter import BASE_PARAMETERS, GaussianAdapter, WorldGaussians
 from .gaussian_focus import GaussianFocusedModule
 from .geometry import Cameras
 from .layers import resize
@@ -19,8 +19,6 @@ from .unet import CostRegulariser
 DEPTH_SHARES = (0.1, 0.1, 0.4, 0.4)
 # Pixels of a block that become channels, a side.
 SHUFFLE = 4
-# Opacity logit, offset within the pixel (2), scales (3), quaternion (4); the spherical harmonics come on top.
-BASE_PARAMETERS = 10
 # conv_image's channels are the feature channels over this.
 IMAGE_SHARE = 16
 

@@ -7,8 +7,8 @@ from torch import Tensor, nn
 from .config import DepthSplatConfig
 from .depth_stage import Matched
 from .encoder import EncodedPyramid
-from .gaussian_adapter import GaussianAdapter
-from .gaussian_head import BASE_PARAMETERS, Predicted
+from .gaussian_adapter import BASE_PARAMETERS, GaussianAdapter
+from .gaussian_head import Predicted
 from .geometry import Cameras
 from .upsampler import Upsampler
 

@@ -15,6 +15,7 @@ from ..runtime.drawing import draw_view
 from ..runtime.errors import exit_on_input_error
 from ..runtime.formats import FORMATS, read_scene, write_scene
 from ..runtime.gaussians import Gaussians
+from .metrics import psnr
 
 VIEWS = 2
 SIDE = 256  # of the picture
@@ -59,9 +60,9 @@ def compare(gaussians: Annotated[int, typer.Option(help="How many.", min=100)] =
             written = time.process_time()
             back = read_scene(path)
             read = time.process_time()
-            psnr = -10 * np.log10(max(float(np.square(_draw(back) - drawn).mean()), 1e-20))
+            quality = psnr(_draw(back), drawn, np.ones(drawn.shape[:2], bool))
             megabytes = path.stat().st_size / 1e6
-            print(f"{suffix:16}{written - started:10.2f}{read - written:10.2f}{megabytes:8.1f}{psnr:10.1f}")
+            print(f"{suffix:16}{written - started:10.2f}{read - written:10.2f}{megabytes:8.1f}{quality:10.1f}")
 
 
 def _draw(scene: Gaussians) -> np.ndarray:

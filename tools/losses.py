@@ -12,8 +12,7 @@ from torch import Tensor
 from ..model.config import IDESplatConfig
 from ..model.dpbu import Boosted
 from ..model.encoder import Encoded
-from ..model.gaussian_adapter import SCALE_SHIFT, SH_C0
-from ..model.gaussian_head import BASE_PARAMETERS
+from ..model.gaussian_adapter import BASE_PARAMETERS, BASE_SIZES, SCALE_SHIFT, SH_C0
 from ..model.layers import repeat_views
 from .baselines import SPLAT_PIXELS
 
@@ -135,7 +134,7 @@ def splat_loss(raw: Tensor) -> Tensor:
 
     raw: what GaussianAdapter is given, [views, parameters, H, W].
     """
-    opacity, offsets, scales, _, sh = raw.split((1, 2, 3, 4, raw.shape[1] - BASE_PARAMETERS), dim=1)
+    opacity, offsets, scales, _, sh = raw.split((*BASE_SIZES, raw.shape[1] - BASE_PARAMETERS), dim=1)
     size = (F.softplus(scales - SCALE_SHIFT).log() - math.log(SPLAT_PIXELS)).abs().mean()
     offset = (offsets.sigmoid() - 0.5).abs().mean()
     colour = SH_C0 * sh[:, :: sh.shape[1] // 3].abs().mean()  # of each channel the band 0
