@@ -50,16 +50,15 @@ class GaussianAdapter(nn.Module):
 
     def forward(self, raw: Tensor, depth: Tensor, images: Tensor, cameras: Cameras) -> WorldGaussians:
         """raw [views, parameters, H, W], depth [views, H, W], images [views, 3, H, W] in [0, 1] -> Gaussians."""
-        sizes = (*BASE_SIZES, 3 * self.coefficients)
-        logits, offsets, scales, rotations, sh = raw.flatten(2).transpose(1, 2).split(sizes, dim=-1)
+        base, sh = raw.flatten(2).split((BASE_PARAMETERS, 3 * self.coefficients), dim=1)
+        logits, offsets, scales, rotations = base.transpose(1, 2).split(BASE_SIZES, dim=-1)
         means = self._means(offsets.sigmoid(), depth, cameras)
         scales = F.softplus(scales - SCALE_SHIFT).clamp(self.scale_min, self.scale_max)
         if self.in_pixels:
             scales = scales * self._pixel_sizes(depth, cameras)
         camera = cameras.extrinsics[:, :3, :3]
         quats = quaternion_product(quaternion_from_matrix(camera)[:, None], _normalise_quaternion(rotations))
-        colours = (images.flatten(2).transpose(1, 2) - 0.5) / SH_C0  # [views, H * W, 3]
-        sh = self._world_harmonics(sh.reshape(*sh.shape[:2], 3, self.coefficients), colours, camera)
+        sh = self._world_harmonics(sh.unflatten(1, (3, self.coefficients)), (images.flatten(2) - 0.5) / SH_C0, camera)
         gaussians = WorldGaussians(means, scales, quats, logits.sigmoid()[..., 0], sh)
         return WorldGaussians(*(x.flatten(0, 1) for x in gaussians))
 
@@ -79,12 +78,16 @@ class GaussianAdapter(nn.Module):
         return (depth.flatten(1) / focal[:, None])[..., None]
 
     def _world_harmonics(self, sh: Tensor, colours: Tensor, camera: Tensor) -> Tensor:
-        """sh [views, H * W, 3, coefficients] as predicted, in the camera's frame -> [views, H * W, coefficients, 3]."""
-        sh = sh * self.sh_decay
-        sh = torch.cat([sh[..., :1] + colours[..., None], sh[..., 1:]], dim=-1)
+        """sh [views, 3, coefficients, H * W] as predicted, in the camera's frame -> [views, H * W, coefficients, 3].
+
+        colours: what is added to the band 0, [views, 3, H * W].
+        """
+        # Pixels stay innermost until the end: moving three numbers at a time takes as long as several convolutions.
+        sh = sh.transpose(1, 2) * self.sh_decay[:, None, None]
+        sh = torch.cat([sh[:, :1] + colours[:, None], sh[:, 1:]], dim=1)
         to_world = harmonic_rotation(camera, self.coefficients)  # [views, coefficients, coefficients]
-        # One product a view; one a pixel takes several times as long.
-        return (sh.flatten(1, 2) @ to_world.transpose(1, 2)).reshape(sh.shape).transpose(-1, -2)
+        turned = (to_world @ sh.flatten(2)).unflatten(2, (3, -1))
+        return turned.flatten(1, 2).transpose(1, 2).unflatten(2, (self.coefficients, 3))
 
 
 def _normalise_quaternion(xyzw: Tensor) -> Tensor:
