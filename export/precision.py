@@ -1,7 +1,7 @@
 """Lower precisions: int8 for processors and fp16 for graphics cards, each for the parts that bear it.
 
-What is in float32 in both: inputs and outputs, geometry, monocular depth, the sparse products, softmax, norms, and what
-makes Gaussians of features.
+What is in float32 in both: inputs and outputs, geometry, monocular depth, the sparse products, softmax, norms, and the
+last convolution before the Gaussians.
 """
 
 import math
@@ -18,9 +18,11 @@ from ..runtime.session import open_session, run_session
 from .stages import names_read
 
 FLOAT32, INT8, FP16 = PRECISIONS = ("float32", "int8", "fp16")
-# By the names of the networks' parts, which name the nodes.
+# By the names of the networks' parts, which name the nodes. Of the Gaussian head all but the last is in it.
 TRANSFORMERS = re.compile(r"/encoder/(vit/blocks\.|transformer/)")
-CONVOLUTIONS = re.compile(r"/(encoder/(vit|backbone)|depth|dpbu\d)/|/gaussians/(residual/|upsampler/|regressor2/)")
+CONVOLUTIONS = re.compile(
+    r"/(encoder/(vit|backbone)|depth|dpbu\d)/|/gaussians/(residual/|upsampler/|regressor\d/|head1/)"
+)
 # Fewer products than this for an output are quicker in float32 than to quantise.
 FEW_TERMS = 64
 LARGEST_BYTE, LARGEST_WEIGHT, LARGEST_BIAS = 255, 127, 1 << 30

@@ -60,14 +60,17 @@ class Case:
     seen: np.ndarray | None = None
 
 
-def procedural_case(seed: int, context: int, drawn: int, targets: int, height: int, width: int) -> Case:
+def procedural_case(
+    seed: int, context: int, drawn: int, targets: int, height: int, width: int, closer: int = 1
+) -> Case:
     """The procedural scene of `seed`, with exact depth; the same arguments give the same case.
 
     Of `drawn` context views along a path, `context` are given to the network: the first, the last, and evenly between.
+    closer: how many times as large targets are drawn as the context; they are windows of such pictures then.
     """
     from .scenes import draw_sample
 
-    sample = draw_sample(seed, drawn, targets, height, width)
+    sample = draw_sample(seed, drawn, targets, height, width, closer=(closer,) * targets)
     given = np.linspace(0, drawn - 1, context).round().astype(int)
 
     def posed(kind: str, views: np.ndarray | slice) -> Posed:

@@ -66,7 +66,8 @@ def draw_sample(
     intrinsics = _draw_intrinsics(rng, context + targets, width / height)
     extrinsics = _draw_cameras(rng, layout, intrinsics, context, targets)
     for view, times in enumerate(closer, start=context):
-        intrinsics[view] = window(intrinsics[view], times, draw_corner(rng, times))
+        if times > 1:
+            intrinsics[view] = window(intrinsics[view], times, rng.uniform(0, times - 1, 2))
     views = [
         photograph(layout.scene, bank, pose, k, height, width, samples)
         for pose, k in zip(extrinsics, intrinsics, strict=True)
@@ -113,11 +114,6 @@ def look_at(eye: np.ndarray, focus: np.ndarray, roll: float = 0.0) -> np.ndarray
     pose[:3, 2] = forward
     pose[:3, 3] = eye
     return pose
-
-
-def draw_corner(rng: np.random.Generator, closer: int) -> np.ndarray:
-    """The corner (x, y), in windows, of a window of the former size in a picture drawn `closer` times as large."""
-    return rng.uniform(0, closer - 1, 2)
 
 
 def window(intrinsics: np.ndarray, closer: int, corner: np.ndarray) -> np.ndarray:
