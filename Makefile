@@ -28,11 +28,11 @@ check: setup
 demo: setup
 	$(BIN)/python -m idesplat.tools.demo demo
 
-# The carried model, trained from nothing: four hours of one core. Stopped at any moment, it goes on where it was.
+# The carried model, trained from nothing: five hours of one core. Stopped at any moment, it goes on where it was.
 weights: setup
 	$(BIN)/idesplat-train --out runs/tiny --steps 4000 --batch 1 --size 256 --seed 0
 	$(BIN)/idesplat-train --out runs/finer --init runs/tiny/last.ckpt --no-gradual \
-		--steps 1000 --lr 5e-4 --vit-lr 2e-4 --batch 1 --size 256 --seed 1
+		--steps 1600 --lr 5e-4 --vit-lr 2e-4 --batch 1 --size 256 --seed 1
 	$(BIN)/python -m idesplat.tools.carry runs/finer/last.ckpt
 
 clean:

@@ -216,7 +216,7 @@ PRESETS: dict[str, IDESplatConfig | DepthSplatConfig] = {
         scale_in_pixels=True,
         # Training makes splats at a picture's border as large as they may be, to cover what no view sees; in views
         # between, they cover what another photograph shows.
-        scale_max=2.0,
+        scale_max=1.5,
         # Its scenes have the unit in which near is 1, and far lies between 2 and 200.
         near=1.0,
         trained_views=(2, 3),
