@@ -1,7 +1,7 @@
 """Lower precisions: int8 for processors and fp16 for graphics cards, each for the parts that bear it.
 
-What is in float32 in both: inputs and outputs, geometry, monocular depth, the sparse products, softmax, norms, and the
-last convolution before the Gaussians.
+What is in float32 in both: inputs and outputs, geometry, monocular depth, the sparse products, softmax, norms, the
+focused module and the last convolution before the Gaussians.
 """
 
 import math

@@ -12,9 +12,10 @@ from idesplat.runtime import Runner
 from idesplat.runtime.bundle import INPUTS, OUTPUTS
 from onnx import TensorProto
 
-# What is not to lose precision: the geometry, monocular depth, the sparse products, what makes Gaussians of features.
+# What is not to lose precision: the geometry, monocular depth, the sparse products, the focused module and the last
+# convolution before the Gaussians.
 EXACT = re.compile(
-    r"/(correlate|weigh)/|/gaussians/(adapter|focus|head|regressor1|expand|fuse)|/encoder/(disparity|fusions|laterals)"
+    r"/(correlate|weigh)/|/gaussians/(adapter|focus|head2|expand|fuse)|/encoder/(disparity|fusions|laterals)"
 )
 
 
