@@ -23,7 +23,7 @@ ROUNDS = 2
 TINY = 1e-9
 # Splats by rule: their standard deviation in pixels, and their opacity. Smaller ones hide less of their neighbours and
 # score higher at the photographs' own size, but leave gaps when seen four times as large, as in a viewer that fills a
-# screen: 0.4 pixels lose twice as much there as they gain.
+# screen (`tools/splat_sizes.py`): 0.4 pixels lose three times as much there as they gain.
 SPLAT_PIXELS, SPLAT_OPACITY = 0.45, 0.95
 
 
