@@ -1,5 +1,7 @@
 """The methods beside the model: a plane's pictures are known exactly, so best plane and true depth must draw them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from idesplat.runtime.cameras import read_cameras
@@ -7,12 +9,12 @@ from idesplat.runtime.depth_range import DepthRange
 from idesplat.runtime.images import find_images
 from idesplat.runtime.point_cloud import unproject
 from idesplat.runtime.views import match
-from idesplat.tools.baselines import best_plane, nearest_view, splats_at, warp_plane
-from idesplat.tools.cases import Posed, seen_by
+from idesplat.tools.baselines import SPLAT_PIXELS, best_plane, nearest_view, splats_at, warp_plane
+from idesplat.tools.cases import Posed, procedural_case, seen_by
 from idesplat.tools.metrics import psnr
 from idesplat.tools.novel_views import draw
 from idesplat.tools.scene_cases import load_case
-from idesplat.tools.scenes import look_at
+from idesplat.tools.scenes import HELD_OUT_SEEDS, look_at
 
 HEIGHT, WIDTH, DEPTH = 60, 80, 4.0
 INTRINSICS = np.array([[1.1, 0, 0.52], [0, 1.4, 0.47], [0, 0, 1]])
@@ -141,3 +143,16 @@ def test_seen_is_what_no_surface_hides_and_no_border_cuts_off() -> None:
     }
     points = np.array([[point(*place) for place in expected]])
     np.testing.assert_array_equal(seen_by(points, depth, views), [list(expected.values())])
+
+
+def test_splats_seen_closer_want_to_be_larger() -> None:
+    """At the true depth 0.3 pixels beat 0.45 as large as the photographs, and leave gaps four times as large."""
+    better = {}
+    for closer in (1, 4):
+        case = procedural_case(HELD_OUT_SEEDS[1], 2, 2, 1, 128, 128, closer)
+        rule = splats_at(case.depth, case.context)
+        small, large = (replace(rule, scales=rule.scales * np.float32(pixels / SPLAT_PIXELS)) for pixels in (0.3, 0.45))
+        truth, seen = case.targets.picture(0), case.seen[0]
+        better[closer] = np.subtract(*(psnr(draw(scene, case.targets, 0).rgb, truth, seen) for scene in (large, small)))
+        assert psnr(draw(large, case.targets, 0).rgb, truth, seen) > 20
+    assert better[1] < 0 < better[4]
