@@ -32,7 +32,7 @@ demo: setup
 weights: setup
 	$(BIN)/idesplat-train --out runs/tiny --steps 4000 --batch 1 --size 256 --seed 0
 	$(BIN)/idesplat-train --out runs/finer --init runs/tiny/last.ckpt --no-gradual \
-		--steps 1600 --lr 5e-4 --vit-lr 2e-4 --batch 1 --size 256 --seed 1
+		--steps 1200 --lr 5e-4 --vit-lr 2e-4 --batch 1 --size 256 --seed 1
 	$(BIN)/python -m idesplat.tools.carry runs/finer/last.ckpt
 
 clean:

@@ -103,9 +103,18 @@ def _round_convolutions(
     (`quantize_static` of ONNX Runtime writes the same, but searches the whole graph at every step, for minutes.)
     """
     weights = {tensor.name: tensor for tensor in model.graph.initializer}
+    given_to = {node.input[0] for node in model.graph.node if node.name in names}
     nodes: list[onnx.NodeProto] = []
     rounded: dict[str, str] = {}
     for node in model.graph.node:
+        if node.op_type == "Pad" and node.output[0] in given_to:
+            # Borders are repeated as integers, a quarter of the bytes.
+            padded = node.output[0]
+            to_integers, back = _rounding(model.graph, node.input[0], padded, ranges[padded])
+            node.input[0], node.output[0] = to_integers.output[0], f"{padded}.padded"
+            back.input[0], rounded[padded] = node.output[0], padded
+            nodes += [to_integers, node, back]
+            continue
         if node.name not in names:
             nodes.append(node)
             continue

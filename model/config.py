@@ -123,6 +123,11 @@ class EncoderConfig:
         return min(sides), max(sides)
 
     @property
+    def window_multiple(self) -> int:
+        """Height and width must be multiples of this for the multi-view transformer's windows to halve evenly."""
+        return 2 * self.attention_splits * self.feature_stride
+
+    @property
     def sh_coefficients(self) -> int:
         """Spherical-harmonic coefficients a colour channel."""
         return (self.sh_degree + 1) ** 2
@@ -147,7 +152,8 @@ class IDESplatConfig(EncoderConfig):
     @property
     def size_multiple(self) -> int:
         """Height and width must be multiples of this: every U-Net and the attention windows halve evenly."""
-        return max(self.feature_stride // unit.scale * unit.unet.side for unit in self.dpbus)
+        halving = (self.feature_stride // unit.scale * unit.unet.side for unit in self.dpbus)
+        return max(self.window_multiple, *halving)
 
 
 @dataclass(frozen=True)
@@ -172,7 +178,8 @@ class DepthSplatConfig(EncoderConfig):
     @property
     def size_multiple(self) -> int:
         """Height and width must be multiples of this: every U-Net and the attention windows halve evenly."""
-        return max(self.feature_stride // 2**index * scale.unet.side for index, scale in enumerate(self.scales))
+        halving = (self.feature_stride // 2**index * scale.unet.side for index, scale in enumerate(self.scales))
+        return max(self.window_multiple, *halving)
 
 
 TWO_SCALES = (

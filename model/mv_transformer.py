@@ -1,14 +1,13 @@
 """The multi-view transformer: windows attend within a view, then to its neighbours (GMFlow, UniMatch)."""
 
 import math
-from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from .layers import attention, fixed, to_map, to_tokens
-from .windows import join_windows, region_mask, shift_back, split_windows
+from .layers import attention
+from .windows import Regions, join_windows, shift_back, split_windows
 
 POSITION_TEMPERATURE = 10000.0
 POSITION_EPSILON = 1e-6
@@ -25,41 +24,22 @@ class MultiViewTransformer(nn.Module):
     def forward(self, features: Tensor, neighbours: Tensor) -> Tensor:
         """Features [views, channels, h, w], neighbours [views, n] -> features of the same shape.
 
-        h and w must be multiples of the number of splits a side; odd layers attend in windows shifted by half.
+        h and w must be multiples of twice the number of splits a side; odd layers attend in windows shifted by half.
         """
         _, channels, height, width = features.shape
         rows, columns = height // self.splits, width // self.splits
         position = sine_position(rows, columns, channels, features).repeat(1, self.splits, self.splits)
-        tokens = to_tokens(features + position)
-        plain = WindowGrid(height, width, rows, columns, None)
-        shifted = plain._replace(mask=region_mask(height, width, rows, columns, features))
+        image = (features + position).permute(0, 2, 3, 1)
+        regions = Regions(self.splits, rows, columns)
         for index, block in enumerate(self.layers):
-            tokens = block(tokens, neighbours, shifted if index % 2 else plain)
-        return to_map(tokens, height, width)
-
-
-class WindowGrid(NamedTuple):
-    """How a layer's tokens are cut into windows; with a mask [windows, tokens, tokens] they are shifted by half."""
-
-    height: int
-    width: int
-    rows: int
-    columns: int
-    mask: Tensor | None
-
-    def split(self, tokens: Tensor) -> Tensor:
-        """[n, h * w, channels] -> [n, windows, rows * columns, channels]."""
-        image = tokens.reshape(-1, self.height, self.width, fixed(tokens.shape[2]))
-        if self.mask is not None:
-            image = shift_back(image, self.rows // 2, self.columns // 2)
-        return split_windows(image, self.rows, self.columns)
-
-    def join(self, windows: Tensor) -> Tensor:
-        """The inverse of `split`."""
-        image = join_windows(windows, self.height, self.width, self.rows, self.columns)
-        if self.mask is not None:
-            image = shift_back(image, self.height - self.rows // 2, self.width - self.columns // 2)
-        return image.reshape(-1, self.height * self.width, fixed(image.shape[3]))
+            if index % 2:
+                windows = split_windows(shift_back(image, rows // 2, columns // 2), rows, columns)
+                image = join_windows(block(windows, neighbours, regions), height, width, rows, columns)
+                image = shift_back(image, height - rows // 2, width - columns // 2)
+            else:
+                windows = block(split_windows(image, rows, columns), neighbours, None)
+                image = join_windows(windows, height, width, rows, columns)
+        return image.permute(0, 3, 1, 2)
 
 
 class TransformerBlock(nn.Module):
@@ -73,10 +53,10 @@ class TransformerBlock(nn.Module):
         self.mlp2 = nn.Linear(2 * channels * ffn_ratio, channels, bias=False)
         self.norm = nn.LayerNorm(channels)
 
-    def forward(self, tokens: Tensor, neighbours: Tensor, grid: WindowGrid) -> Tensor:
-        """Tokens [views, h * w, channels] -> the same shape. The neighbours are seen as they were before the block."""
-        source = tokens + self.self_attn(tokens, tokens, None, grid)
-        message = self.cross_attn(source, tokens, neighbours, grid)
+    def forward(self, windows: Tensor, neighbours: Tensor, regions: Regions | None) -> Tensor:
+        """Windows [views, windows, tokens, channels] -> the same shape; the neighbours' are those before the block."""
+        source = windows + self.self_attn(windows, windows, None, regions)
+        message = self.cross_attn(source, windows, neighbours, regions)
         message = self.mlp2(F.gelu(self.mlp1(torch.cat([source, message], dim=-1))))
         return source + self.norm(message)
 
@@ -92,18 +72,23 @@ class WindowAttention(nn.Module):
         self.merge = nn.Linear(channels, channels, bias=False)
         self.norm = nn.LayerNorm(channels)
 
-    def forward(self, source: Tensor, target: Tensor, neighbours: Tensor | None, grid: WindowGrid) -> Tensor:
-        """source and target [views, h * w, channels] -> message of the same shape."""
-        q = grid.split(self.q_proj(source))  # [views, windows, tokens, channels]
-        k, v = grid.split(self.k_proj(target)), grid.split(self.v_proj(target))
-        mask = grid.mask
+    def forward(self, source: Tensor, target: Tensor, neighbours: Tensor | None, regions: Regions | None) -> Tensor:
+        """source and target [views, windows, tokens, channels] -> message of the same shape.
+
+        With regions (of windows that were shifted), tokens attend within these alone.
+        """
+        q, k, v = self.q_proj(source), self.k_proj(target), self.v_proj(target)
         if neighbours is not None:
             # The windows of all neighbours as one sequence [views, windows, tokens * n, channels], neighbours fastest.
-            # The releases tile the mask all the same, so that with two neighbours or more it hides other tokens than
-            # those that the shift brought together. The weights were trained with it.
+            # The releases' mask of regions is repeated over it as if they were slowest, so that with two neighbours or
+            # more a region is seen with other tokens than its own. The weights were trained with it.
             k, v = (x[neighbours].permute(0, 2, 3, 1, 4).flatten(2, 3) for x in (k, v))
-            mask = None if mask is None else mask.repeat(1, 1, neighbours.shape[1])
-        return self.norm(self.merge(grid.join(attention(q, k, v, mask))))
+        if regions is None:
+            message = attention(q, k, v)
+        else:
+            groups = zip(*(regions.split(x) for x in (q, k, v)), strict=True)
+            message = regions.join([attention(*group) for group in groups])
+        return self.norm(self.merge(message))
 
 
 def sine_position(rows: int, columns: int, channels: int, like: Tensor) -> Tensor:

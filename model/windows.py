@@ -1,4 +1,7 @@
-"""Cutting token images into attention windows, and the mask that shifted windows need (Swin)."""
+"""Cutting token images into attention windows, and shifted windows into regions, or the mask that says so (Swin)."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -7,6 +10,8 @@ from .layers import fixed
 
 # Added to the score between tokens that only a cyclic shift brought together.
 MASKED = -100.0
+# Into how many parts the windows of each group of regions fall, down and across.
+HALVES = ((1, 1), (1, 2), (2, 1), (2, 2))
 
 
 def split_windows(image: Tensor, rows: int, columns: int) -> Tensor:
@@ -31,6 +36,45 @@ def shift_back(image: Tensor, rows: int, columns: int) -> Tensor:
     """
     image = torch.cat([image[:, rows:], image[:, :rows]], dim=1)
     return torch.cat([image[:, :, columns:], image[:, :, :columns]], dim=2)
+
+
+class Regions(NamedTuple):
+    """What lies together in windows [rows, columns] that were shifted by half, of `splits` a side.
+
+    The shift brings tokens from opposite borders into the last window of each axis, whose halves must not meet.
+    Attention within such regions computes what a mask over whole windows does, with half the products for two
+    splits. The windows come in four groups: neither axis in halves, columns, rows, both.
+    """
+
+    splits: int
+    rows: int
+    columns: int
+
+    def split(self, windows: Tensor) -> list[Tensor]:
+        """[n, windows, m * rows * columns, channels] -> four groups [regions, m * tokens of a region, channels]."""
+        channels = fixed(windows.shape[3])
+        grid = windows.reshape(-1, self.splits, self.splits, windows.shape[2], channels)
+        groups = []
+        for down, right in HALVES:
+            part = grid[:, -1:] if down > 1 else grid[:, :-1]
+            part = part[:, :, -1:] if right > 1 else part[:, :, :-1]
+            rows, across = self.rows // down, self.columns // right * channels
+            part = part.reshape(-1, windows.shape[2] // (self.rows * self.columns), down, rows, right, across)
+            regions = part.permute(0, 2, 4, 1, 3, 5)
+            groups.append(regions.reshape(-1, windows.shape[2] // (down * right), channels))
+        return groups
+
+    def join(self, groups: Sequence[Tensor]) -> Tensor:
+        """The inverse of `split`, for m = 1."""
+        channels, tokens = fixed(groups[0].shape[2]), self.rows * self.columns
+        parts = []
+        for (down, right), regions in zip(HALVES, groups, strict=True):
+            across = self.columns // right * channels
+            part = regions.reshape(-1, down, right, self.rows // down, across).transpose(2, 3)
+            shape = (1 if down > 1 else self.splits - 1), (1 if right > 1 else self.splits - 1)
+            parts.append(part.reshape(-1, *shape, tokens, channels))
+        upper, lower = torch.cat(parts[:2], dim=2), torch.cat(parts[2:], dim=2)
+        return torch.cat([upper, lower], dim=1).flatten(1, 2)
 
 
 def region_mask(height: int, width: int, rows: int, columns: int, like: Tensor) -> Tensor:

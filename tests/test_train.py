@@ -74,7 +74,7 @@ def test_tiny_preset_is_small_and_complete() -> None:
         model, released = IDESplat(config), IDESplat(PRESETS["idesplat-re10k"])
     assert sum(parameter.numel() for parameter in model.parameters()) <= 4_000_000
     assert {type(part) for part in model.modules()} == {type(part) for part in released.modules()}
-    assert 256 % config.size_multiple == 0 and config.size_multiple == 16
+    assert 256 % config.size_multiple == 0 and config.size_multiple == 32
 
 
 def test_perfect_depth_costs_nothing_and_more_error_more() -> None:
