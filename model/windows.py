@@ -42,7 +42,7 @@ class Regions(NamedTuple):
     """What lies together in windows [rows, columns] that were shifted by half, of `splits` a side.
 
     The shift brings tokens from opposite borders into the last window of each axis, whose halves must not meet.
-    Attention within such regions computes what a mask over whole windows does, with half the products for two
+    Attention within such regions computes what a mask over whole windows does, with 9/16 of the products for two
     splits. The windows come in four groups: neither axis in halves, columns, rows, both.
     """
 
