@@ -5,7 +5,7 @@ from torch import Tensor, nn
 
 from .config import FocusConfig
 from .layers import ConvFFN, DepthwiseConv, to_map, to_tokens
-from .windows import join_windows, region_mask, shift_back, split_windows
+from .windows import join_windows, region_mask, split_windows
 
 EPSILON = 1e-10
 
@@ -103,17 +103,13 @@ class FocusedLayer(nn.Module):
     def _split(self, tokens: Tensor, height: int, width: int) -> Tensor:
         """[views, h * w, channels] -> [views, windows, heads, tokens, channels / heads], shifted in odd layers."""
         image = tokens.reshape(-1, height, width, self.heads * self.head_channels)
-        if self.shifted:
-            image = shift_back(image, self.window // 2, self.window // 2)
-        windows = split_windows(image, self.window, self.window)
+        windows = split_windows(image, self.window, self.window, self.shifted)
         return windows.reshape(tokens.shape[0], -1, self.window**2, self.heads, self.head_channels).transpose(2, 3)
 
     def _join(self, windows: Tensor, height: int, width: int) -> Tensor:
         """The inverse of `_split`."""
         windows = windows.transpose(2, 3).reshape(-1, self.window**2, self.heads * self.head_channels)
-        image = join_windows(windows, height, width, self.window, self.window)
-        if self.shifted:
-            image = shift_back(image, height - self.window // 2, width - self.window // 2)
+        image = join_windows(windows, height, width, self.window, self.window, self.shifted)
         return image.reshape(-1, height * width, self.heads * self.head_channels)
 
 

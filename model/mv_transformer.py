@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .layers import attention
-from .windows import Regions, join_windows, shift_back, split_windows
+from .windows import Regions, join_windows, split_windows
 
 POSITION_TEMPERATURE = 10000.0
 POSITION_EPSILON = 1e-6
@@ -32,13 +32,10 @@ class MultiViewTransformer(nn.Module):
         image = (features + position).permute(0, 2, 3, 1)
         regions = Regions(self.splits, rows, columns)
         for index, block in enumerate(self.layers):
-            if index % 2:
-                windows = split_windows(shift_back(image, rows // 2, columns // 2), rows, columns)
-                image = join_windows(block(windows, neighbours, regions), height, width, rows, columns)
-                image = shift_back(image, height - rows // 2, width - columns // 2)
-            else:
-                windows = block(split_windows(image, rows, columns), neighbours, None)
-                image = join_windows(windows, height, width, rows, columns)
+            shifted = index % 2 == 1
+            windows = split_windows(image, rows, columns, shifted)
+            windows = block(windows, neighbours, regions if shifted else None)
+            image = join_windows(windows, height, width, rows, columns, shifted)
         return image.permute(0, 3, 1, 2)
 
 

@@ -14,28 +14,34 @@ MASKED = -100.0
 HALVES = ((1, 1), (1, 2), (2, 1), (2, 2))
 
 
-def split_windows(image: Tensor, rows: int, columns: int) -> Tensor:
-    """[n, h, w, channels] -> [n, windows, rows * columns, channels]; h and w are multiples of rows and columns."""
+def split_windows(image: Tensor, rows: int, columns: int, shifted: bool = False) -> Tensor:
+    """[n, h, w, channels] -> [n, windows, rows * columns, channels]; h and w are multiples of rows and columns.
+
+    Shifted windows lie half a window further down and right, and go on at the opposite border.
+    """
     count, height, width, _ = image.shape
     channels = fixed(image.shape[3])
+    if shifted:
+        image = _moved(image, rows // 2, columns // 2)
     image = image.reshape(-1, height // rows, rows, width // columns, columns, channels)
     return image.permute(0, 1, 3, 2, 4, 5).reshape(count, -1, rows * columns, channels)
 
 
-def join_windows(windows: Tensor, height: int, width: int, rows: int, columns: int) -> Tensor:
+def join_windows(windows: Tensor, height: int, width: int, rows: int, columns: int, shifted: bool = False) -> Tensor:
     """The inverse of `split_windows`, from windows [..., rows * columns, channels] to [n, h, w, channels]."""
     channels = fixed(windows.shape[-1])
     image = windows.reshape(-1, height // rows, width // columns, rows, columns, channels)
-    return image.permute(0, 1, 3, 2, 4, 5).reshape(-1, height, width, channels)
+    image = image.permute(0, 1, 3, 2, 4, 5).reshape(-1, height, width, channels)
+    return _moved(image, height - rows // 2, width - columns // 2) if shifted else image
 
 
-def shift_back(image: Tensor, rows: int, columns: int) -> Tensor:
-    """[n, h, w, channels] moved cyclically up and left by the given numbers of pixels.
+def _moved(image: Tensor, up: int, left: int) -> Tensor:
+    """[n, h, w, channels] moved cyclically by so many pixels.
 
     torch.roll by a size that is only known at run time cannot be exported.
     """
-    image = torch.cat([image[:, rows:], image[:, :rows]], dim=1)
-    return torch.cat([image[:, :, columns:], image[:, :, :columns]], dim=2)
+    image = torch.cat([image[:, up:], image[:, :up]], dim=1)
+    return torch.cat([image[:, :, left:], image[:, :, :left]], dim=2)
 
 
 class Regions(NamedTuple):
