@@ -24,7 +24,7 @@ FEW = 256
 DOMAIN = "idesplat"
 # What both products share: rows [pairs, candidates, h * w], table [rows, channels] and `by_pixel` [pairs, h * w, ...]
 # -> products [steps, step, ...], of a step's pixels, each of `shape`, with the rows that they gather. A step takes a
-# block: 16 pixels in the coarsest maps, where they gather most, 256 in the finest.
+# block: 16 pixels in the releases' coarsest maps, where they gather most, 256 in the finest.
 STEPS = """
         candidates = Shape <start = 1, end = 2> (rows)
         pixels = Shape <start = 2, end = 3> (rows)

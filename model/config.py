@@ -1,5 +1,7 @@
 """Every size of the networks, as frozen configurations, and the presets of the released checkpoints."""
 
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 
@@ -84,7 +86,7 @@ class UpsamplerConfig:
 
 
 @dataclass(frozen=True)
-class EncoderConfig:
+class EncoderConfig(ABC):
     """What both networks have: the encoder, the Gaussians' parameters, and the cameras and images of the training."""
 
     # Image size over the coarsest feature map's, 4 or 8.
@@ -123,9 +125,19 @@ class EncoderConfig:
         return min(sides), max(sides)
 
     @property
-    def window_multiple(self) -> int:
-        """Height and width must be multiples of this for the multi-view transformer's windows to halve evenly."""
-        return 2 * self.attention_splits * self.feature_stride
+    @abstractmethod
+    def unets(self) -> Iterator[tuple[int, UNetConfig]]:
+        """The U-Nets that regularise costs, each with its maps' resolution over that of the coarsest."""
+
+    @property
+    def size_multiple(self) -> int:
+        """Height and width must be multiples of this: every U-Net and the shifted attention windows halve evenly."""
+        windows = 2 * self.attention_splits * self.feature_stride
+        return max(windows, *(self.feature_stride // scale * unet.side for scale, unet in self.unets))
+
+    def smallest_map(self, scale: int) -> int:
+        """Pixels of the smallest map of `scale` times the coarsest resolution; all such maps have multiples of them."""
+        return (self.size_multiple * scale // self.feature_stride) ** 2
 
     @property
     def sh_coefficients(self) -> int:
@@ -150,10 +162,9 @@ class IDESplatConfig(EncoderConfig):
     focus: FocusConfig = FocusConfig()
 
     @property
-    def size_multiple(self) -> int:
-        """Height and width must be multiples of this: every U-Net and the attention windows halve evenly."""
-        halving = (self.feature_stride // unit.scale * unit.unet.side for unit in self.dpbus)
-        return max(self.window_multiple, *halving)
+    def unets(self) -> Iterator[tuple[int, UNetConfig]]:
+        """Those of the three units."""
+        return ((unit.scale, unit.unet) for unit in self.dpbus)
 
 
 @dataclass(frozen=True)
@@ -176,10 +187,9 @@ class DepthSplatConfig(EncoderConfig):
         return self.feature_stride // 2 ** (len(self.scales) - 1)
 
     @property
-    def size_multiple(self) -> int:
-        """Height and width must be multiples of this: every U-Net and the attention windows halve evenly."""
-        halving = (self.feature_stride // 2**index * scale.unet.side for index, scale in enumerate(self.scales))
-        return max(self.window_multiple, *halving)
+    def unets(self) -> Iterator[tuple[int, UNetConfig]]:
+        """Those of its scales."""
+        return ((2**index, scale.unet) for index, scale in enumerate(self.scales))
 
 
 TWO_SCALES = (

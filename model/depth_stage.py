@@ -43,7 +43,7 @@ class DepthStage(nn.Module):
         self.stride = config.feature_stride // 2**scale
         cnn = (config.feature_channels, config.backbone_channels[1])[scale]
         matching = config.feature_channels // 2**scale
-        self.products = SparseProducts(CORNERS * self.candidates * matching, unet.side**2)
+        self.products = SparseProducts(CORNERS * self.candidates * matching, config.smallest_map(2**scale))
         inputs = self.candidates + cnn + matching + config.vit.dim // 2**scale
         self.regulariser = CostRegulariser(inputs, unet.channels, unet)
         self.shortcut = nn.Conv2d(inputs, unet.channels, 1)

@@ -32,8 +32,8 @@ class DepthProbabilityBoostingUnit(nn.Module):
     def __init__(self, config: IDESplatConfig, unit: DPBUConfig) -> None:
         super().__init__()
         self.candidates = unit.candidates
-        self.first = EpipolarAttention(unit, config.ffn_ratio, config.ffn_kernel)
-        self.second = EpipolarAttention(unit, config.ffn_ratio, config.ffn_kernel)
+        self.first = EpipolarAttention(config, unit)
+        self.second = EpipolarAttention(config, unit)
 
     def boost(
         self, features: Tensor, context: Tensor, seed: Tensor, candidates: Tensor, neighbours: Tensor, cameras: Cameras

@@ -6,7 +6,7 @@ The releases multiply sparsely in a CUDA extension; here the same sums run over 
 import torch
 from torch import Tensor, nn
 
-from .config import DPBUConfig
+from .config import DPBUConfig, IDESplatConfig
 from .layers import ConvFFN, fixed, repeat_views, to_map, to_tokens
 from .sparse_products import SparseProducts, pixel_table
 from .unet import CostRegulariser
@@ -18,11 +18,11 @@ EPSILON = 1e-10
 class EpipolarAttention(nn.Module):
     """Warp-index epipolar attention (IDESplat, section 2)."""
 
-    def __init__(self, config: DPBUConfig, ffn_ratio: int, ffn_kernel: int) -> None:
+    def __init__(self, network: IDESplatConfig, unit: DPBUConfig) -> None:
         super().__init__()
-        channels, candidates = config.channels, config.candidates
+        channels, candidates = unit.channels, unit.candidates
         self.scale = channels**-0.5
-        self.products = SparseProducts(channels * candidates, config.unet.side**2)
+        self.products = SparseProducts(channels * candidates, network.smallest_map(unit.scale))
         # Position embeddings of the candidates, for keys, values and scores.
         self.key_position = nn.Parameter(torch.zeros(candidates))
         self.value_position = nn.Parameter(torch.zeros(candidates))
@@ -33,10 +33,10 @@ class EpipolarAttention(nn.Module):
         self.q_proj = nn.Linear(channels, channels)
         self.k_proj = nn.Linear(channels, channels)
         self.v_proj = nn.Linear(channels, channels)
-        self.regulariser = CostRegulariser(candidates + 1, candidates, config.unet)
+        self.regulariser = CostRegulariser(candidates + 1, candidates, unit.unet)
         self.proj = nn.Linear(channels, channels)
         self.norm2 = nn.LayerNorm(channels)
-        self.ffn = ConvFFN(channels, ffn_ratio, ffn_kernel)
+        self.ffn = ConvFFN(channels, network.ffn_ratio, network.ffn_kernel)
 
     def forward(self, features: Tensor, seed: Tensor, rows: Tensor, prior: Tensor | None) -> tuple[Tensor, Tensor]:
         """Attend along the epipolar lines.

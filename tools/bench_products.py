@@ -46,9 +46,9 @@ SHAPES = {
     "IDESplat, unit 2": Shape(128, 129, 64, 4, 64),
     "IDESplat, unit 3": Shape(256, 65, 32, 4, 256),
     "DepthSplat, four pixels a candidate": Shape(64, 512, 128, 21, 16),
-    "idesplat-tiny, unit 1": Shape(64, 97, 64, 21, 16),
-    "idesplat-tiny, unit 2": Shape(128, 25, 32, 4, 64),
-    "idesplat-tiny, unit 3": Shape(256, 9, 8, 4, 256),
+    "idesplat-tiny, unit 1": Shape(64, 97, 64, 21, 64),
+    "idesplat-tiny, unit 2": Shape(128, 25, 32, 4, 256),
+    "idesplat-tiny, unit 3": Shape(256, 9, 8, 4, 1024),
 }
 
 
