@@ -11,8 +11,9 @@ import onnx
 import torch
 
 from ..runtime.bundle import INPUTS, METADATA_KEY, OUTPUTS, Description
+from .int8 import Feeds
 from .optimize import simplify
-from .precision import Feeds, in_precision
+from .precision import in_precision
 from .sparse_products import explain, in_steps
 from .stages import NamedTensors, Stage, example_inputs, find_stages, stage_graph
 from .weights import fill_inputs

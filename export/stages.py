@@ -4,7 +4,6 @@ A stage is an attribute of the network; `encoder.features_mv` is a field of what
 them a later stage reads is not written down anywhere: it is read off the traced graph, and so cannot go stale.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +15,7 @@ from ..model.depth_stage import PredictedDepth
 from ..model.gaussian_head import Predicted
 from ..model.networks import Network
 from ..runtime.bundle import INPUTS
+from .nodes import names_read, nodes_between
 
 
 @dataclass(frozen=True)
@@ -77,34 +77,6 @@ def stage_graph(traced: onnx.ModelProto, stage: Stage) -> onnx.ModelProto:
     weights = [weight for weight in traced.graph.initializer if weight.name in read]
     graph = onnx.helper.make_graph(nodes, stage.name, inputs, outputs, weights)
     return onnx.helper.make_model(graph, opset_imports=traced.opset_import)
-
-
-def nodes_between(
-    traced: onnx.ModelProto, borders: set[str], outputs: Iterable[str]
-) -> tuple[list[onnx.NodeProto], set[str]]:
-    """The nodes on every way back from `outputs` to the first border tensors, in their order, and those tensors."""
-    producers = {output: index for index, node in enumerate(traced.graph.node) for output in node.output}
-    met, found, open_names = set(), set(), list(outputs)
-    while open_names:
-        name = open_names.pop()
-        if name in borders:
-            met.add(name)
-        elif name in producers and producers[name] not in found:
-            found.add(producers[name])
-            open_names.extend(names_read(traced.graph.node[producers[name]]))
-    return [traced.graph.node[index] for index in sorted(found)], met
-
-
-def names_read(node: onnx.NodeProto) -> set[str]:
-    """The tensors that a node reads, those included that the graphs inside it take from around it."""
-    read = set(node.input)
-    for attribute in node.attribute:
-        if attribute.type == onnx.AttributeProto.GRAPH:
-            inner = attribute.g
-            own = {value.name for value in (*inner.input, *inner.initializer)}
-            own.update(name for step in inner.node for name in step.output)
-            read.update(name for step in inner.node for name in names_read(step) if name not in own)
-    return read - {""}
 
 
 def example_inputs(views: int, height: int, width: int, near: float, far: float) -> dict[str, Tensor]:

@@ -4,8 +4,8 @@ import numpy as np
 import onnx
 import onnxruntime
 import torch
+from idesplat.export.nodes import names_read
 from idesplat.export.sparse_products import FEW, in_steps
-from idesplat.export.stages import names_read
 from idesplat.model import sparse_products as gathered
 from idesplat.model.sparse_products import SparseProducts
 from idesplat.tools import sparse_products as compiled
