@@ -139,7 +139,8 @@ class _Convolutions:
         more_inputs = 0 if kernel[0].size % LANES == 0 else -inputs % LANES
         kernel = np.pad(kernel, [(0, more_outputs), (0, more_inputs), *[(0, 0)] * (kernel.ndim - 2)])
         bias = [np.pad(values, (0, more_outputs)) for values in bias]
-        node.input[0] = self._widened(given, more_inputs, kernel.ndim) if more_inputs else self._numbers(given, given)
+        read = self._widened(given, more_inputs, kernel.ndim) if more_inputs else given
+        node.input[0] = self._numbers(read, given)
         node.input[1:] = self._rounded_weights(node, [kernel, *bias], _step(self.ranges[given]))
         node.output[0] = f"{result}.exact"
         self.nodes.append(node)
@@ -168,13 +169,15 @@ class _Convolutions:
         return results
 
     def _widened(self, name: str, channels: int, axes: int) -> str:
-        """A tensor as the numbers that its integers stand for, with so many channels of zeros more."""
-        pads = np.zeros(
-            (2, axes), np.int64
-        )  # (naming the one axis instead is more than ONNX Runtime's optimiser bears)
-        pads[1, 1] = channels
-        given = [self._integers(name, name), self._constant(f"{name}.pads", pads.ravel()), self._scale(name)[1]]
-        return self._dequantize(self._add("Pad", given, f"{name}.integers.wide"), name, f"{name}.wide")
+        """A tensor whose integers are those of another in its range, and so many channels of zeros."""
+        wide = f"{name}.wide"
+        if (wide, name) not in self.integers:
+            # Padding the one axis by its number is more than ONNX Runtime's optimiser bears.
+            pads = np.zeros((2, axes), np.int64)
+            pads[1, 1] = channels
+            given = [self._integers(name, name), self._constant(f"{wide}.pads", pads.ravel()), self._scale(name)[1]]
+            self.integers[wide, name] = self._add("Pad", given, f"{wide}.integers")
+        return wide
 
     def _narrowed(self, name: str, channels: int) -> str:
         """The first channels of a tensor."""

@@ -10,17 +10,20 @@ from idesplat.export.int8 import in_int8
 from idesplat.export.nodes import sort_nodes
 from idesplat.runtime.session import open_session, run_session
 
-# A convolution of an odd number of channels, put together and with its border repeated, into an odd number of others.
+# A convolution of an odd number of channels, put together and with their border repeated; two more read its result.
 GRAPH = """<ir_version: 10, opset_import: ["": 20]>
-net (float[1, 5, h, w] a, float[1, 6, h, w] b) => (float[1, 9, h, w] once, float[1, 7, h, w] twice)
-<float[9, 11, 3, 3] kernel1, float[9] bias1, float[7, 9, 3, 3] kernel2, float[7] bias2, int64[8] border>
+net (float[1, 5, h, w] a, float[1, 6, h, w] b)
+    => (float[1, 9, h, w] once, float[1, 7, h, w] twice, float[1, 2, h, w] beside)
+<float[9, 11, 3, 3] kernel1, float[9] bias1, float[7, 9, 3, 3] kernel2, float[7] bias2, float[2, 9, 3, 3] kernel3,
+    int64[8] border>
 {
     [both] joined = Concat <axis = 1> (a, b)
     [border] padded = Pad <mode = "edge"> (joined, border)
     [first] once = Conv (padded, kernel1, bias1)
     [second] twice = Conv <pads = [1, 1, 1, 1]> (once, kernel2, bias2)
+    [third] beside = Conv <pads = [1, 1, 1, 1]> (once, kernel3)
 }"""
-WEIGHTS = {"kernel1": (9, 11, 3, 3), "bias1": (9,), "kernel2": (7, 9, 3, 3), "bias2": (7,)}
+WEIGHTS = {"kernel1": (9, 11, 3, 3), "bias1": (9,), "kernel2": (7, 9, 3, 3), "bias2": (7,), "kernel3": (2, 9, 3, 3)}
 
 
 @pytest.fixture(scope="module")
@@ -59,8 +62,10 @@ def test_it_computes_what_rounding_by_hand_does(network, rounded):
     once = _nearest(first, torch.from_numpy(exact["once"]))
     second = F.conv2d(once, _nearest_kernel(w["kernel2"]), w["bias2"], padding=1)
     twice = _nearest(second, torch.from_numpy(exact["twice"]))
+    third = F.conv2d(once, _nearest_kernel(w["kernel3"]), padding=1)
+    beside = _nearest(third, torch.from_numpy(exact["beside"]))
     found = run_session(open_session(rounded.SerializeToString()), inputs)
-    for name, expected in {"once": once, "twice": twice}.items():
+    for name, expected in {"once": once, "twice": twice, "beside": beside}.items():
         steps = torch.from_numpy(found[name]).double().sub(expected).div(_step(torch.from_numpy(exact[name]))).abs()
         assert steps.max() < (1.01 if name == "once" else 4)  # a number half way between two steps, and what follows
         assert (steps < 0.01).double().mean() > 0.95
@@ -76,7 +81,7 @@ def test_what_only_convolutions_read_is_moved_as_integers(rounded):
 
 def test_kernels_have_multiples_of_four_channels(rounded):
     kernels = [tensor for tensor in rounded.graph.initializer if len(tensor.dims) == 4]
-    assert {tuple(kernel.dims[:2]) for kernel in kernels} == {(12, 12), (8, 12)}
+    assert {tuple(kernel.dims[:2]) for kernel in kernels} == {(12, 12), (8, 12), (4, 12)}
     assert {kernel.data_type for kernel in kernels} == {onnx.TensorProto.INT8}
 
 
