@@ -90,6 +90,9 @@ def _options(tuning: Tuning) -> onnxruntime.SessionOptions:
     # Its planning is quadratic in the number of nodes: without it a session opens ten times faster, and a run takes
     # neither longer nor more memory, because the arena reuses buffers all the same.
     options.enable_mem_reuse = False
+    # From a first run it would learn one block for all of the next, and keep the first's memory besides: half as much
+    # again, for no time.
+    options.enable_mem_pattern = False
     # Left alone, ONNX Runtime 1.31 pins a thread to every core, also to those that the process was told to keep off.
     restricted = usable_cores() < (os.cpu_count() or 1)
     options.intra_op_num_threads = tuning.threads or (usable_cores() if restricted else AS_MANY_AS_CORES)
@@ -135,13 +138,7 @@ def _open_cached(model: Path, options: onnxruntime.SessionOptions) -> onnxruntim
 
 
 def run_session(session: onnxruntime.InferenceSession, feeds: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Run a graph on the feeds that it takes, and return its outputs by name.
-
-    The memory that the run took is given back. Kept for the next, as ONNX Runtime does left alone, it falls to pieces
-    there, and a second run takes half as much again as the first.
-    """
+    """Run a graph on the feeds that it takes, and return its outputs by name."""
     wanted = {entry.name: feeds[entry.name] for entry in session.get_inputs()}
     outputs = [entry.name for entry in session.get_outputs()]
-    options = onnxruntime.RunOptions()
-    options.add_run_config_entry("memory.enable_memory_arena_shrinkage", "cpu:0")
-    return dict(zip(outputs, session.run(outputs, wanted, options), strict=True))
+    return dict(zip(outputs, session.run(outputs, wanted), strict=True))
