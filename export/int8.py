@@ -144,10 +144,11 @@ class _Convolutions:
         node.input[1:] = self._rounded_weights(node, [kernel, *bias], _step(self.ranges[given]))
         node.output[0] = f"{result}.exact"
         self.nodes.append(node)
-        self.integers[result, result] = self._quantize(node.output[0], result)
+        integers = self._quantize(node.output[0], result)
         if more_outputs:
-            self.integers[result, result] = self._narrowed(self.integers[result, result], outputs)
-        self.numbers[result, result] = self._dequantize(self.integers[result, result], result, result)
+            integers = self._narrowed(integers, outputs)
+        self.integers[result, result] = integers
+        self.numbers[result, result] = self._dequantize(integers, result, result)
 
     def _rounded_weights(self, node: onnx.NodeProto, weights: list[np.ndarray], step: np.float32) -> list[str]:
         """The kernel and bias of a convolution whose input has this step, rounded."""

@@ -105,14 +105,14 @@ def _serve(pipe: Connection, prepare: Callable[..., Prepared], arguments: tuple)
             started = time.perf_counter()
             result = run()
             pipe.send(Run(time.perf_counter() - started, result))
-        pipe.send(_peak_bytes())
+        pipe.send(peak_bytes())
     except EOFError:  # who measures is gone
         pass
     except Exception as error:
         pipe.send(Failed(" ".join(str(error).split()) or type(error).__name__))
 
 
-def _peak_bytes() -> int | None:
+def peak_bytes() -> int | None:
     """The most memory that this process held."""
     try:  # getrusage would count the parent's, whose copy this process was for a moment
         status = Path("/proc/self/status").read_text()
