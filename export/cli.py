@@ -14,6 +14,7 @@ from ..runtime.bundle import MANIFEST_NAME, Description, StageFile, write_manife
 from ..runtime.errors import InputError, exit_on_input_error
 from ..runtime.files import check_writable, make_folder
 from ..runtime.sizes import parse_size, size_fits, size_rule
+from ..runtime.terminal import run
 
 if TYPE_CHECKING:
     from ..model.networks import Network
@@ -65,7 +66,7 @@ def export(
 
 def main() -> None:
     """Entry point of idesplat-export."""
-    typer.run(export)
+    run(export)
 
 
 def _check_targets(out: Path | None, staged: Path | None) -> Path:

@@ -13,6 +13,7 @@ import typer
 from .camera_format import ESTIMATE, CameraFormat
 from .errors import InputError, exit_on_input_error
 from .files import check_writable, make_folder, replacing
+from .terminal import run
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -177,7 +178,7 @@ def infer(
 
 def main() -> None:
     """Entry point of idesplat-infer."""
-    typer.run(infer)
+    run(infer)
 
 
 def _say_pictures(views: int, save_depth: Path | None, render: Path | None) -> None:

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from .errors import InputError, exit_on_input_error
+from .terminal import run
 
 
 @exit_on_input_error
@@ -41,4 +42,4 @@ def convert(
 
 def main() -> None:
     """Entry point of idesplat-convert."""
-    typer.run(convert)
+    run(convert)

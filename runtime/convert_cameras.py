@@ -9,6 +9,7 @@ import typer
 
 from .camera_format import CameraFormat
 from .errors import InputError, exit_on_input_error
+from .terminal import run
 
 if TYPE_CHECKING:
     from .cameras import Camera
@@ -55,7 +56,7 @@ def convert(
 
 def main() -> None:
     """Entry point of idesplat-cameras."""
-    app()
+    run(app)
 
 
 def _lenses(cameras: "Sequence[Camera]") -> str:

@@ -19,6 +19,7 @@ from .progress import progress
 from .rasterizer import Rendering
 from .shots import FULL_TURN, SWING, along_path, around, fitted, overview
 from .sizes import parse_size
+from .terminal import run
 from .video_out import open_video
 
 VIDEO, PICTURE = ".mp4", ".png"
@@ -84,7 +85,7 @@ def render(
 
 def main() -> None:
     """Run the command."""
-    typer.run(render)
+    run(render)
 
 
 def _check_out(out: Path) -> None:

@@ -9,6 +9,7 @@ import typer
 
 from .cameras import CameraFormat
 from .errors import InputError, exit_on_input_error
+from .terminal import run
 
 if TYPE_CHECKING:
     from .cameras import Camera
@@ -74,7 +75,7 @@ def view(
 
 def main() -> None:
     """Entry point of idesplat-view."""
-    typer.run(view)
+    run(view)
 
 
 def _check_page(html: Path) -> None:

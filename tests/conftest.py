@@ -5,6 +5,7 @@ import shutil
 import sys
 from pathlib import Path
 
+import idesplat.runtime  # noqa: F401  # first: it switches ONNX Runtime's telemetry off
 import pytest
 import torch
 from idesplat.model.config import (

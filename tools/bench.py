@@ -22,6 +22,7 @@ import typer
 from ..runtime.errors import InputError, exit_on_input_error
 from ..runtime.files import check_writable
 from ..runtime.sizes import parse_size
+from ..runtime.terminal import run
 
 if TYPE_CHECKING:  # nothing heavy is loaded before there is something to measure
     from .bench_report import Row
@@ -112,7 +113,7 @@ def bench(
 
 def main() -> None:
     """Run the command."""
-    typer.run(bench)
+    run(bench)
 
 
 # ---- measuring

@@ -21,6 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ..runtime.session import usable_cores
+from ..runtime.terminal import run
 from .bench import SETTLE_SECONDS, thread_environment
 from .bench_worker import Prepared, Worker
 
@@ -231,4 +232,4 @@ def ply_file(folder: Path, verb: str) -> Prepared:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run(main)

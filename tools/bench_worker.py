@@ -2,12 +2,14 @@
 
 import json
 import multiprocessing
+import os
 import signal
 import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from math import prod
 from multiprocessing.connection import Connection
@@ -27,6 +29,7 @@ LOOPS = ("Scan", "Loop", "If")
 # Operators whose FLOP are counted, as a graph has them before it is optimised.
 PRODUCTS = ("MatMul", "MatMulInteger", "Gemm", "Conv", "ConvTranspose")
 RUN = "run"
+SAFE_PATH = "PYTHONSAFEPATH"
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,8 @@ class Worker:
         context = multiprocessing.get_context("spawn")
         self._pipe, other = context.Pipe()
         self._process = context.Process(target=_serve, args=(other, prepare, arguments), daemon=True)
-        self._process.start()
+        with _safe_path():
+            self._process.start()
         other.close()
         self.about = self._answer()
 
@@ -93,6 +97,20 @@ class Worker:
         if isinstance(answer, Failed):
             raise answer
         return answer
+
+
+@contextmanager
+def _safe_path() -> Iterator[None]:
+    """Keep the Python processes that start meanwhile from importing modules of the current folder."""
+    before = os.environ.get(SAFE_PATH)
+    os.environ[SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[SAFE_PATH]
+        else:
+            os.environ[SAFE_PATH] = before
 
 
 def _serve(pipe: Connection, prepare: Callable[..., Prepared], arguments: tuple) -> None:

@@ -15,6 +15,7 @@ from ..export.cli import export
 from ..runtime.default_model import CHECKSUM_SUFFIX, FOLDER, NAME
 from ..runtime.errors import exit_on_input_error
 from ..runtime.files import make_folder, replacing
+from ..runtime.terminal import run
 
 PRESET = "idesplat-tiny"
 
@@ -33,7 +34,7 @@ def carry(
 
 def main() -> None:
     """Run the command."""
-    typer.run(carry)
+    run(carry)
 
 
 if __name__ == "__main__":

@@ -29,6 +29,7 @@ from ..model.networks import Network, build
 from ..runtime.errors import InputError, exit_on_input_error
 from ..runtime.scene_frame import SceneFrame
 from ..runtime.session import CPU
+from ..runtime.terminal import run
 from .bench import thread_environment
 from .bench_worker import Failed, Prepared, Worker, Workload, example_arrays, exported
 
@@ -210,7 +211,7 @@ def draw(network: Network, seed: int = 0) -> None:
 
 def main() -> None:
     """Run the command."""
-    typer.run(table)
+    run(table)
 
 
 if __name__ == "__main__":

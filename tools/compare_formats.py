@@ -15,6 +15,7 @@ from ..runtime.drawing import draw_view
 from ..runtime.errors import exit_on_input_error
 from ..runtime.formats import FORMATS, read_scene, write_scene
 from ..runtime.gaussians import Gaussians
+from ..runtime.terminal import run
 from .metrics import psnr
 
 VIEWS = 2
@@ -75,7 +76,7 @@ def _draw(scene: Gaussians) -> np.ndarray:
 
 def main() -> None:
     """Run the command."""
-    typer.run(compare)
+    run(compare)
 
 
 if __name__ == "__main__":

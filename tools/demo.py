@@ -11,6 +11,7 @@ import typer
 from ..runtime.cli import infer
 from ..runtime.errors import exit_on_input_error
 from ..runtime.files import make_folder
+from ..runtime.terminal import run
 from .make_scene import make_scene
 
 
@@ -32,7 +33,7 @@ def demo(out: Annotated[Path, typer.Argument(help="Folder for everything.")] = P
 
 def main() -> None:
     """Run the command."""
-    typer.run(demo)
+    run(demo)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from ..runtime.default_model import default_model
 from ..runtime.errors import InputError, exit_on_input_error
 from ..runtime.files import check_writable, make_folder
 from ..runtime.sizes import parse_size
+from ..runtime.terminal import run
 
 if TYPE_CHECKING:  # nothing heavy is loaded before there is something to evaluate
     import numpy as np
@@ -170,7 +171,7 @@ def procedural(
 
 def main() -> None:
     """Entry point of idesplat-eval."""
-    app()
+    run(app)
 
 
 def _names(frames: "list[tuple[Path, Camera]]", numbers: list[int]) -> str:

@@ -18,6 +18,7 @@ import typer
 
 from ..runtime.errors import exit_on_input_error
 from ..runtime.files import make_folder, replacing
+from ..runtime.terminal import run
 
 if TYPE_CHECKING:  # compiled code is loaded only once there is something to draw
     from .scene_geometry import Layout
@@ -69,7 +70,7 @@ def make_scene(
 
 def main() -> None:
     """Run the command."""
-    typer.run(make_scene)
+    run(make_scene)
 
 
 def _intrinsics(width: int, height: int) -> np.ndarray:

@@ -15,6 +15,7 @@ from ..runtime.drawing import draw_view
 from ..runtime.errors import exit_on_input_error
 from ..runtime.images_out import depth_colours, save_png
 from ..runtime.runner import Runner
+from ..runtime.terminal import run
 from ..runtime.views import prepare
 
 # Two photographs, and one between them that the model is not given.
@@ -44,7 +45,7 @@ def picture(
 
 def main() -> None:
     """Run the command."""
-    typer.run(picture)
+    run(picture)
 
 
 if __name__ == "__main__":

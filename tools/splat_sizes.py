@@ -19,6 +19,7 @@ from ..runtime.default_model import default_model
 from ..runtime.errors import exit_on_input_error
 from ..runtime.gaussians import Gaussians
 from ..runtime.runner import Runner
+from ..runtime.terminal import run
 from .baselines import SPLAT_PIXELS, splats_at
 from .cases import Case, procedural_case
 from .metrics import psnr
@@ -67,4 +68,4 @@ def _psnr(gaussians: Gaussians, case: Case, view: int) -> float:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run(main)

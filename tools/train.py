@@ -16,6 +16,7 @@ import typer
 
 from ..runtime.errors import InputError, exit_on_input_error
 from ..runtime.files import make_folder
+from ..runtime.terminal import run
 from .curriculum import Objective, Phase, curriculum, phase_at, rate_at
 
 if TYPE_CHECKING:  # torch and compiled code are loaded only once there is something to train
@@ -233,7 +234,7 @@ def _keep_memory() -> None:
 
 def main() -> None:
     """Run the command."""
-    typer.run(train)
+    run(train)
 
 
 if __name__ == "__main__":
