@@ -1,6 +1,5 @@
 """What idesplat-infer is given, brought together: photographs or a video, their cameras or none, views and size."""
 
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -8,6 +7,7 @@ from pathlib import Path
 from .camera_format import ESTIMATE, CameraFormat
 from .cameras import Camera, read_cameras
 from .errors import InputError
+from .files import scratch_folder
 from .images import cover, stem
 from .photographs import find_photographs
 from .progress import working
@@ -50,9 +50,9 @@ def read_inputs(request: Request, runner: Runner) -> Inputs:
 
     Raises InputError for whatever cannot be used.
     """
-    with tempfile.TemporaryDirectory() as folder:
+    with scratch_folder() as folder:
         given = None if request.cameras == ESTIMATE else Path(request.cameras)
-        images = find_photographs(request.images, given, request.camera_format, Path(folder))
+        images = find_photographs(request.images, given, request.camera_format, folder)
         notes = []
         if given is None:
             from .estimate import estimate_cameras
@@ -68,7 +68,7 @@ def read_inputs(request: Request, runner: Runner) -> Inputs:
         pairs = match(images, cameras)
         if request.frames is None and len(cameras) > len(pairs):
             notes.append(f"{len(cameras) - len(pairs)} of {len(cameras)} cameras have no photograph among those given")
-        own = [camera if path.parent != Path(folder) else replace(camera, name=path.name) for path, camera in pairs]
+        own = [camera if path.parent != folder else replace(camera, name=path.name) for path, camera in pairs]
         height, width = parse_size(request.size) if request.size else runner.size_for(own)
         count = min(_wanted(request, runner) or len(pairs), len(pairs))
         runner.check_size(max(count, FEWEST_VIEWS), height, width)

@@ -2,13 +2,14 @@
 
 import contextlib
 import webbrowser
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from .cameras import CameraFormat
-from .errors import InputError, exit_on_input_error
+from .errors import InputError, Terminated, exit_on_input_error
 from .terminal import run
 
 if TYPE_CHECKING:
@@ -52,14 +53,15 @@ def view(
     gaussians = read_scene(scene)
     viewpoints = read_viewpoints(cameras, camera_format, [*(images or []), *(more_images or [])])
     if html is None:
+        from .serving import address
         from .viewer import serving
 
-        with serving(gaussians, viewpoints, host, port) as server, contextlib.suppress(KeyboardInterrupt):
-            address = f"http://{host}:{server.get_port()}"
+        with serving(gaussians, viewpoints, host, port) as server, _until_interrupted():
+            page = address(host, server.get_port())
             click = "a click at a camera leads there, " if viewpoints else ""
-            print(f"{len(gaussians):,} Gaussians to look at: {address} ({click}stop with Ctrl-C)", flush=True)
+            print(f"{len(gaussians):,} Gaussians to look at: {page} ({click}stop with Ctrl-C)", flush=True)
             if browser:
-                webbrowser.open(address)
+                webbrowser.open(page)
             server.sleep_forever()
         return
     from .files import replacing
@@ -78,6 +80,17 @@ def main() -> None:
     run(view)
 
 
+@contextlib.contextmanager
+def _until_interrupted() -> Iterator[None]:
+    """Take Ctrl-C, by which a user ends this command, for its success; another signal is none."""
+    try:
+        yield
+    except Terminated:
+        raise
+    except KeyboardInterrupt:
+        return
+
+
 def _check_page(html: Path) -> None:
     """Find out before the work whether the page can be written."""
     from .files import check_writable
@@ -92,10 +105,10 @@ def read_viewpoints(cameras: Path | None, form: CameraFormat | None, images: lis
 
     Raises InputError for what cannot be read, or does not belong together.
     """
-    import tempfile
     from dataclasses import replace
 
     from .cameras import read_cameras
+    from .files import scratch_folder
     from .photographs import find_photographs
     from .progress import progress
     from .viewer import Viewpoint
@@ -108,8 +121,8 @@ def read_viewpoints(cameras: Path | None, form: CameraFormat | None, images: lis
             Viewpoint(replace(camera, distortion=None, fisheye=False), None)
             for camera in read_cameras(cameras, form=form)
         ]
-    with tempfile.TemporaryDirectory() as folder:
-        files = find_photographs(images, cameras, form, Path(folder))
+    with scratch_folder() as folder:
+        files = find_photographs(images, cameras, form, folder)
         pairs = match(files, read_cameras(cameras, files, form))
         return [_viewpoint(file, camera) for file, camera in progress(pairs, "reading photographs")]
 

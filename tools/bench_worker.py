@@ -5,7 +5,6 @@ import multiprocessing
 import os
 import signal
 import sys
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -246,11 +245,12 @@ def example_arrays(workload: Workload, near: float, far: float) -> tuple[np.ndar
 
 def _profile(model: Path, provider: str, threads: int, workload: Workload, optimise: bool) -> list[dict[str, Any]]:
     """ONNX Runtime's notes on every operator of a run; where it is optimised, of one that is not the first."""
+    from ..runtime.files import scratch_folder
     from ..runtime.runner import Runner
     from ..runtime.session import Tuning
 
-    with tempfile.TemporaryDirectory() as folder:
-        runner = Runner(model, provider, Tuning(threads, Path(folder) / "profile", optimise))
+    with scratch_folder() as folder:
+        runner = Runner(model, provider, Tuning(threads, folder / "profile", optimise))
         images, extrinsics, intrinsics, *_ = example_arrays(workload, runner.description.near, runner.description.far)
         for _ in range(TIMES_PROFILED if optimise else 1):
             runner.predict_arrays(images, extrinsics, intrinsics)
