@@ -14,7 +14,7 @@ from ..runtime.bundle import MANIFEST_NAME, Description, StageFile, write_manife
 from ..runtime.errors import InputError, exit_on_input_error
 from ..runtime.files import check_writable, make_folder
 from ..runtime.sizes import parse_size, size_fits, size_rule
-from ..runtime.terminal import run
+from ..runtime.terminal import run, say, warn
 
 if TYPE_CHECKING:
     from ..model.networks import Network
@@ -60,7 +60,7 @@ def export(
     fixed = Fixed(views, _fitting_size(size, model.config.size_multiple) if size else None)
     description = describe(model, name, checkpoint.name, digest, fixed, precision)
     if not _export(model, description, fixed, folder, out, staged):
-        print("error: the graph departs from the network (see the table); nothing was written", file=sys.stderr)
+        warn("error: the graph departs from the network (see the table); nothing was written")
         raise SystemExit(PARITY_BREACH)
 
 
@@ -103,17 +103,17 @@ def _load(checkpoint: Path, preset: str | None) -> "tuple[Network, str, str]":
 
     if preset is not None and preset not in PRESETS:
         raise InputError(f"--preset {preset}: unknown; choose one of {', '.join(PRESETS)}")
-    print(f"reading {checkpoint}")
+    say(f"reading {checkpoint}")
     digest = file_sha256(checkpoint)
     warning = name_hash_warning(checkpoint, digest)
     if warning:
-        print(f"warning: {warning}", file=sys.stderr)
+        warn(f"warning: {warning}")
     tensors = read_state_dict(checkpoint)
     name = preset or infer_preset(checkpoint, tensors)
     model = build(name)
     fill(model, tensors, checkpoint)
     count = sum(parameter.numel() for parameter in model.parameters())
-    print(f"preset {name}, {count:,} parameters")
+    say(f"preset {name}, {count:,} parameters")
     return model.eval(), name, digest
 
 
@@ -164,7 +164,7 @@ def _export(
     with tempfile.TemporaryDirectory(prefix=".idesplat-export.", dir=folder) as working:
         with console.status("tracing the network (a minute or so)"):
             graphs = freeze(network, description, fixed, Path(working))
-        print(f"traced: {graphs.nodes} nodes, opset {OPSET}, {graphs.bytes / 1e6:.0f} MB")
+        say(f"traced: {graphs.nodes} nodes, opset {OPSET}, {graphs.bytes / 1e6:.0f} MB")
         rows = []
         with console.status("verifying against PyTorch") as status:
             for row in verify(network, graphs, description, fixed):
@@ -202,11 +202,11 @@ def _write_stages(graphs: "Graphs", staged: Path) -> None:
 
 def _say_written(paths: list[Path], model: Path, description: Description) -> None:
     """What was written and how to use it."""
-    print("\n".join(f"wrote {path}" for path in paths))
+    say(*(f"wrote {path}" for path in paths))
     if len(paths) > 1:
-        print(f"{paths[1].name} holds the weights: move it along with {model.name}")
+        say(f"{paths[1].name} holds the weights: move it along with {model.name}")
     makes = "a splat" if description.gaussians else "depth and a point cloud"
-    print(f"make {makes} with: idesplat-infer --model {model} --images ... --cameras ... --out scene.ply")
+    say(f"make {makes} with: idesplat-infer --model {model} --images ... --cameras ... --out scene.ply")
 
 
 def _print_table(rows: "list[Parity]") -> None:

@@ -13,7 +13,7 @@ import typer
 from .camera_format import ESTIMATE, CameraFormat
 from .errors import InputError, exit_on_input_error
 from .files import check_writable, make_folder, replacing
-from .terminal import run
+from .terminal import run, say
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -161,17 +161,17 @@ def infer(
             temporary.write_text(json.dumps(summary, indent=2) + "\n")
         written.append(json_path)
     for note in inputs.notes:
-        print(note)
-    print(f"near {span.near:.4g} and far {span.far:.4g}, in the cameras' unit: {span.source}")
+        say(note)
+    say(f"near {span.near:.4g} and far {span.far:.4g}, in the cameras' unit: {span.source}")
     for path in written:
-        print(f"wrote {path}")
+        say(f"wrote {path}")
     _say_pictures(len(prepared.names), save_depth, render)
     if prediction.gaussians is not None and holds_splats(out):
         _say_how_to_look(out, given, save_cameras)
     else:
-        print(f"open {out} in MeshLab, CloudCompare or Blender")
+        say(f"open {out} in MeshLab, CloudCompare or Blender")
     if report is not None:
-        print(f"open {report} in any browser")
+        say(f"open {report} in any browser")
     if timings:
         _print_timings(seconds)
 
@@ -183,9 +183,9 @@ def main() -> None:
 
 def _say_pictures(views: int, save_depth: Path | None, render: Path | None) -> None:
     if save_depth is not None:
-        print(f"wrote {save_depth}: {views} depth maps, as .png to look at and as .npz in the cameras' unit")
+        say(f"wrote {save_depth}: {views} depth maps, as .png to look at and as .npz in the cameras' unit")
     if render is not None:
-        print(f"wrote {render}: {views} views and {PATH_FRAMES} frames of a path through them, as .png")
+        say(f"wrote {render}: {views} views and {PATH_FRAMES} frames of a path through them, as .png")
 
 
 def _say_how_to_look(out: Path, given: "Request", save_cameras: Path | None) -> None:
@@ -197,11 +197,11 @@ def _say_how_to_look(out: Path, given: "Request", save_cameras: Path | None) -> 
     elif save_cameras is not None:
         cameras = ["--cameras", str(save_cameras)]
     photographs = ["--images", str(given.images[0])] if cameras and len(given.images) == 1 else []
-    print(f"open {out} in any splat viewer (SuperSplat, for one), look at it in the browser, or draw it:")
-    print("    " + shlex.join(["idesplat-view", str(out), *cameras, *photographs]))
-    print("    " + shlex.join(["idesplat-render", str(out), *cameras, "--out"]) + " DIR")
+    say(f"open {out} in any splat viewer (SuperSplat, for one), look at it in the browser, or draw it:")
+    say("    " + shlex.join(["idesplat-view", str(out), *cameras, *photographs]))
+    say("    " + shlex.join(["idesplat-render", str(out), *cameras, "--out"]) + " DIR")
     if not cameras:
-        print("    (--save-cameras FILE.json keeps the cameras that were found, to be given here as --cameras)")
+        say("    (--save-cameras FILE.json keeps the cameras that were found, to be given here as --cameras)")
 
 
 def _check_outputs(out: Path, files: "Sequence[Path | None]", folders: "Sequence[Path | None]") -> None:
@@ -260,7 +260,7 @@ def _clean(prediction: "Prediction", views: "Views", cleaning: "Cleaning") -> "t
 
     whole = prediction.need_gaussians()
     gaussians, taken = clean(whole, prediction.depth, views.extrinsics, views.intrinsics, cleaning)
-    print(describe(taken, len(gaussians)))
+    say(describe(taken, len(gaussians)))
     return replace(prediction, gaussians=gaussians), taken
 
 
@@ -272,7 +272,7 @@ def _write_scene(prediction: "Prediction", views: "Views", out: Path, cleaning: 
 
     if not is_surface(out) and prediction.gaussians is not None:
         for note in write_scene(out, prediction.gaussians):
-            print(f"note: {note}")
+            say(f"note: {note}")
         return
     points = points_from_depth(prediction.depth, views.images, views.extrinsics, views.intrinsics)
     if is_surface(out):
@@ -370,4 +370,4 @@ def _summary(
 
 def _print_timings(seconds: dict[str, float]) -> None:
     for name, value in seconds.items():
-        print(f"{name:>10} {value:8.2f} s")
+        say(f"{name:>10} {value:8.2f} s")

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from .errors import InputError, exit_on_input_error
-from .terminal import run
+from .terminal import run, say
 
 
 @exit_on_input_error
@@ -34,10 +34,10 @@ def convert(
         whole, gaussians = len(gaussians), gaussians.taken(gaussians.opacities >= min_opacity)
         if not len(gaussians):
             raise InputError(f"--min-opacity {min_opacity:g}: no Gaussian is left of {whole}; use a smaller one")
-        print(f"cleaned: {whole - len(gaussians):,} too faint; {len(gaussians):,} Gaussians left")
+        say(f"cleaned: {whole - len(gaussians):,} too faint; {len(gaussians):,} Gaussians left")
     for note in write_scene(out, gaussians):
-        print(f"note: {note}")
-    print(f"wrote {out}: {len(gaussians):,} Gaussians, {out.stat().st_size / 1e6:.1f} MB")
+        say(f"note: {note}")
+    say(f"wrote {out}: {len(gaussians):,} Gaussians, {out.stat().st_size / 1e6:.1f} MB")
 
 
 def main() -> None:

@@ -9,7 +9,7 @@ import typer
 
 from .camera_format import CameraFormat
 from .errors import InputError, exit_on_input_error
-from .terminal import run
+from .terminal import run, say
 
 if TYPE_CHECKING:
     from .cameras import Camera
@@ -50,8 +50,8 @@ def convert(
     pictures = [*(images or []), *(more_images or [])]
     found = read_cameras(cameras, find_images(pictures) if pictures else (), camera_format)
     write_cameras(out, found)
-    print(f"read {len(found)} cameras as {camera_format or recognise(cameras)}: {_lenses(found)}")
-    print(f"wrote {out}")
+    say(f"read {len(found)} cameras as {camera_format or recognise(cameras)}: {_lenses(found)}")
+    say(f"wrote {out}")
 
 
 def main() -> None:

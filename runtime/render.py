@@ -19,7 +19,7 @@ from .progress import progress
 from .rasterizer import Rendering
 from .shots import FULL_TURN, SWING, along_path, around, fitted, overview
 from .sizes import parse_size
-from .terminal import run
+from .terminal import run, say
 from .video_out import open_video
 
 VIDEO, PICTURE = ".mp4", ".png"
@@ -78,9 +78,9 @@ def render(
     else:
         written = _pictures(draw, shots, out, kinds, photographs)
     for file in written if len(written) <= MOST_LISTED else [f"{len(written)} files in {out}"]:
-        print(f"wrote {file}")
+        say(f"wrote {file}")
     pictures = "1 picture" if len(shots) == 1 else f"{len(shots)} pictures"
-    print(f"{len(gaussians):,} Gaussians drawn in {pictures}; open {out} in any {_viewer(out)}")
+    say(f"{len(gaussians):,} Gaussians drawn in {pictures}; open {out} in any {_viewer(out)}")
 
 
 def main() -> None:

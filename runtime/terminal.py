@@ -42,19 +42,21 @@ def run(command: "Callable[..., Any] | typer.Typer") -> None:
         app = typer.Typer(add_completion=False)
         app.command()(command)
         command = app
-    with _ending_by_signals(), _own_streams(), _without_warnings(), _without_native_messages():
+    with _ending_by_signals() as received, _own_streams(), _without_warnings(), _without_native_messages():
         status = _status(command)
+    if received and status == SIGNALLED + signal.SIGINT:  # typer takes each for Ctrl-C
+        status = SIGNALLED + received[-1]
     if status:
         raise SystemExit(status)
 
 
-def say(text: str) -> None:
+def say(*lines: str) -> None:
     """Print lines, with control characters that names hold as escapes.
 
     Raises InputError if standard output cannot be written, and BrokenPipeError if its reader is gone.
     """
     try:
-        print("\n".join(printable(line) for line in text.split("\n")), flush=True)
+        print("\n".join(map(printable, lines)), flush=True)
     except BrokenPipeError:
         raise
     except OSError as error:
@@ -98,21 +100,26 @@ def _report_usage(error: Any) -> int:
 
 
 @contextlib.contextmanager
-def _ending_by_signals() -> Iterator[None]:
-    """Let the signals that ask a process to end do so by an exception, so that what it was at is cleaned up."""
+def _ending_by_signals() -> Iterator[list[int]]:
+    """Let the signals that ask a process to end do so by an exception, so that what it was at is cleaned up.
+
+    Yields a list of those that came.
+    """
+    received: list[int] = []
 
     def end(number: int, frame: FrameType | None) -> None:
+        received.append(number)
         raise Terminated(number)
 
     if threading.current_thread() is not threading.main_thread():
-        yield
+        yield received
         return
     # What the caller ignores, as nohup does, stays ignored.
     taken = [number for number in ENDING_SIGNALS if signal.getsignal(number) is signal.SIG_DFL]
     for number in taken:
         signal.signal(number, end)
     try:
-        yield
+        yield received
     finally:
         for number in taken:
             signal.signal(number, signal.SIG_DFL)

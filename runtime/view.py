@@ -10,7 +10,7 @@ import typer
 
 from .cameras import CameraFormat
 from .errors import InputError, Terminated, exit_on_input_error
-from .terminal import run
+from .terminal import run, say
 
 if TYPE_CHECKING:
     from .cameras import Camera
@@ -59,7 +59,7 @@ def view(
         with serving(gaussians, viewpoints, host, port) as server, _until_interrupted():
             page = address(host, server.get_port())
             click = "a click at a camera leads there, " if viewpoints else ""
-            print(f"{len(gaussians):,} Gaussians to look at: {page} ({click}stop with Ctrl-C)", flush=True)
+            say(f"{len(gaussians):,} Gaussians to look at: {page} ({click}stop with Ctrl-C)")
             if browser:
                 webbrowser.open(page)
             server.sleep_forever()
@@ -72,7 +72,7 @@ def view(
         page = standalone_page(gaussians, viewpoints)
     with replacing(html) as temporary:
         temporary.write_text(page, encoding="utf-8")
-    print(f"wrote {html}: {len(gaussians):,} Gaussians, {html.stat().st_size / 1e6:.1f} MB; open it in any browser")
+    say(f"wrote {html}: {len(gaussians):,} Gaussians, {html.stat().st_size / 1e6:.1f} MB; open it in any browser")
 
 
 def main() -> None:

@@ -7,7 +7,6 @@ the same networks in eager PyTorch where that is installed.
 
 import os
 import platform
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -22,7 +21,7 @@ import typer
 from ..runtime.errors import InputError, exit_on_input_error
 from ..runtime.files import check_writable
 from ..runtime.sizes import parse_size
-from ..runtime.terminal import run
+from ..runtime.terminal import run, say, warn
 
 if TYPE_CHECKING:  # nothing heavy is loaded before there is something to measure
     from .bench_report import Row
@@ -92,21 +91,21 @@ def bench(
         interrupted = True
     for row in rows:
         if row.problem:
-            print(f"{row.name}: {row.problem}", file=sys.stderr)
+            warn(f"{row.name}: {row.problem}")
     rows = [row for row in rows if row.seconds]
     if rows:
         print_rows(rows)
     if rows and json_path is not None:
         write_rows(json_path, _machine(settings), rows)
-        print(f"wrote {json_path}")
+        say(f"wrote {json_path}")
     if interrupted:
-        print("interrupted: what was not finished is missing", file=sys.stderr)
+        warn("interrupted: what was not finished is missing")
         raise SystemExit(INTERRUPTED)
     if not rows:
         raise InputError("nothing could be measured, for the reasons above")
     worse = compare_rows(rows, before) if compare is not None else []
     for line in worse:
-        print(f"worse: {line}", file=sys.stderr)
+        warn(f"worse: {line}")
     if worse:
         raise SystemExit(WORSE)
 
@@ -226,7 +225,7 @@ def _add_shares(row: "Row", entry: Entry, workload: "Workload", settings: Settin
         with Worker(analyse, entry.model, entry.provider, settings.threads, workload) as worker:
             row.operators, row.stages, row.flop = (worker.about[part] for part in ("operators", "stages", "flop"))
     except Failed as problem:
-        print(f"{row.name}: nothing is known of where its time goes ({problem})", file=sys.stderr)
+        warn(f"{row.name}: nothing is known of where its time goes ({problem})")
 
 
 # ---- what is measured

@@ -1,6 +1,6 @@
 """The rasteriser and .ply files, timed in turn with what else does their work: numbers for docs/performance.md.
 
-python -m idesplat.tools.bench_parts
+python -P -m idesplat.tools.bench_parts
 
 gsplat's torch reference projects and colours on a CPU, but composites with CUDA alone: that step is ours, in torch as
 well, with every fragment of the image at once, sorted by pixel and depth.

@@ -1,6 +1,6 @@
 """The sparse products in ONNX Runtime, gathered at once and in steps: numbers for docs/performance.md.
 
-python -m idesplat.tools.bench_products
+python -P -m idesplat.tools.bench_products
 """
 
 import tempfile

@@ -1,6 +1,6 @@
 """How far depth moves where one part of a network multiplies in bfloat16: numbers for docs/performance.md.
 
-python -m idesplat.tools.bfloat16 [MODEL]
+python -P -m idesplat.tools.bfloat16 [MODEL]
 
 What a processor does that multiplies in bfloat16 and adds in float32 is done by hand: operands are rounded before.
 """

@@ -1,6 +1,6 @@
 """Make a trained checkpoint the model that is carried along.
 
-    python -m idesplat.tools.carry runs/tiny/last.ckpt
+    python -P -m idesplat.tools.carry runs/tiny/last.ckpt
 
 Exports it, verified, to `runtime/default/`, and writes its checksum beside it.
 """

@@ -1,6 +1,6 @@
 """The main job on a scene drawn here: photographs and cameras, and what the carried model makes of them.
 
-python -m idesplat.tools.demo demo
+python -P -m idesplat.tools.demo demo
 """
 
 from pathlib import Path

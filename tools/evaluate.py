@@ -13,7 +13,7 @@ from ..runtime.default_model import default_model
 from ..runtime.errors import InputError, exit_on_input_error
 from ..runtime.files import check_writable, make_folder
 from ..runtime.sizes import parse_size
-from ..runtime.terminal import run
+from ..runtime.terminal import run, say
 
 if TYPE_CHECKING:  # nothing heavy is loaded before there is something to evaluate
     import numpy as np
@@ -73,7 +73,7 @@ def scene(
     shape = parse_size(size) if size else runner.size_for([camera for _, camera in frames])
     for sources, held_out in chosen:
         runner.check_size(len(sources), *shape)
-        print(f"held out {_names(frames, held_out)}, inferred from {_names(frames, sources)}")
+        say(f"held out {_names(frames, held_out)}, inferred from {_names(frames, sources)}")
     find_range = partial(runner.depth_range, near=near, far=far)
     cases = (load_case(frames, *numbers, shape, find_range, depth) for numbers in chosen)
     results = _evaluate(cases, len(chosen), Evaluator(runner, load_lpips()), out, pictured=len(chosen))
@@ -115,7 +115,7 @@ def chunks(
     cases = chunk_cases(files, entries, shape, (near, far), skipped.__setitem__)
     results = _evaluate(cases, len(entries), evaluator, out, PICTURED, skipped.__setitem__)
     for key, reason in skipped.items():
-        print(f"skipped {key}: {reason}")
+        say(f"skipped {key}: {reason}")
     missing = len(entries) - len(results) - len(skipped)
     if not results:
         raise InputError(
@@ -125,7 +125,7 @@ def chunks(
     means = mean_of_scenes(results)
     print_means(means, f"{len(results)} of the index's {len(entries)} scenes, {_by(shape)}")
     if missing:
-        print(f"{missing} of the index's scenes are not in {folder}")
+        say(f"{missing} of the index's scenes are not in {folder}")
     about = {"command": "chunks", "index": str(index), "size": shape, "skipped": skipped, "missing": missing}
     _write(out, about, runner, means, results)
 
@@ -224,5 +224,5 @@ def _write(
     path = write_results(
         out, about | {"model": {"path": str(runner.path), **asdict(runner.description)}}, means, results
     )
-    print(f"wrote {path}")
-    print(f"pictures (truth, render, error, depth, and the best plane where there is one) are beside it in {out}")
+    say(f"wrote {path}")
+    say(f"pictures (truth, render, error, depth, and the best plane where there is one) are beside it in {out}")

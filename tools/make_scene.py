@@ -1,4 +1,4 @@
-"""The command `python -m idesplat.tools.make_scene`: a procedural room as a folder of photographs, cameras and depth.
+"""The command `python -P -m idesplat.tools.make_scene`: a procedural room as photographs, cameras and depth.
 
     OUT_DIR/images/000.png ...     the photographs
     OUT_DIR/transforms.json        their cameras, as nerfstudio writes them
@@ -18,7 +18,7 @@ import typer
 
 from ..runtime.errors import exit_on_input_error
 from ..runtime.files import make_folder, replacing
-from ..runtime.terminal import run
+from ..runtime.terminal import run, say
 
 if TYPE_CHECKING:  # compiled code is loaded only once there is something to draw
     from .scene_geometry import Layout
@@ -65,7 +65,7 @@ def make_scene(
             np.savez_compressed(temporary, depth=depth)
     with replacing(out_dir / "transforms.json") as temporary:
         temporary.write_text(json.dumps(_transforms(poses, intrinsics, width, height), indent=1) + "\n")
-    print(f"{views} photographs in {images}, their cameras in {out_dir / 'transforms.json'}, true depth in {depths}")
+    say(f"{views} photographs in {images}, their cameras in {out_dir / 'transforms.json'}, true depth in {depths}")
 
 
 def main() -> None:

@@ -1,6 +1,6 @@
 """How large a pixel's splat should be: PSNR by size, of views as large as the photographs and closer.
 
-    python -m idesplat.tools.splat_sizes --scenes 24
+    python -P -m idesplat.tools.splat_sizes --scenes 24
 
 Small splats hide little of their neighbours and are best at the photographs' own size; seen closer they leave gaps.
 """

@@ -16,7 +16,7 @@ import typer
 
 from ..runtime.errors import InputError, exit_on_input_error
 from ..runtime.files import make_folder
-from ..runtime.terminal import run
+from ..runtime.terminal import run, say
 from .curriculum import Objective, Phase, curriculum, phase_at, rate_at
 
 if TYPE_CHECKING:  # torch and compiled code are loaded only once there is something to train
@@ -127,8 +127,8 @@ class Run:
             scenes.close()
         self.save()
         folder = self.folder
-        print(f"{folder / CHECKPOINT}: the trained network, for idesplat-export; {folder / LOG}: every step")
-        print(f"{folder / CURVES} and {folder / PICTURES}: curves, and photograph, truth, prediction and error")
+        say(f"{folder / CHECKPOINT}: the trained network, for idesplat-export; {folder / LOG}: every step")
+        say(f"{folder / CURVES} and {folder / PICTURES}: curves, and photograph, truth, prediction and error")
 
     def phase(self, step: int) -> Phase:
         """The phase of a step, counted from 0."""
