@@ -18,8 +18,8 @@ from typing import TypeVar
 
 import onnxruntime
 
-from .cache_folder import cache_folder
 from .files import open_regular, scratch_folder
+from .user_cache import cache_folder
 
 LAYOUT = 1
 SUFFIX = ".onnx"
@@ -85,7 +85,7 @@ def place_for(model: Path) -> Place | None:
         content = model.read_bytes()
         if EXTERNAL in content:  # those files' content would have to be part of the key
             return None
-        folder = cache_folder() / "graphs"
+        folder = cache_folder("graphs")
         folder.mkdir(parents=True, exist_ok=True)
     except (OSError, RuntimeError):  # RuntimeError: there is no home folder
         return None

@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from idesplat.runtime.default_model import default_model
@@ -17,6 +18,8 @@ from idesplat.runtime.files import replacing, scratch_folder
 from idesplat.runtime.gaussians import with_colours
 from idesplat.runtime.ply import write_ply
 
+COLUMNS = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2")
+COLUMNS += ("rot_0", "rot_1", "rot_2", "rot_3")
 POSIX = pytest.mark.skipif(os.name == "nt", reason="pipes and signals of POSIX")
 MODEL = {  # of COLMAP, as its documentation writes it
     "cameras.txt": "1 PINHOLE 640 480 500 500 320 240\n",
@@ -78,7 +81,7 @@ def test_no_code_of_the_current_folder_runs_in_benchmarks(tmp_path):
     )
     script = tmp_path.parent / f"{tmp_path.name}.py"
     script.write_text(code)
-    done = subprocess.run([sys.executable, "-P", script], cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    done = subprocess.run([sys.executable, script], cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert done.stdout == "idesplat-tiny\n", done.stderr
     assert not sprung.exists()
 
@@ -103,7 +106,7 @@ def test_texts_name_the_safe_way_to_run_modules():
 
 @POSIX
 def test_nothing_but_our_cache_is_left_behind(scene, tmp_path):
-    """Neither ONNX Runtime's device id and events, nor what numba compiled, nor a temporary file."""
+    """Neither ONNX Runtime's device id and events nor a temporary file."""
     home, temporary, work = (tmp_path / name for name in ("home", "tmp", "work"))
     for folder in (home, temporary, work):
         folder.mkdir()
@@ -111,11 +114,19 @@ def test_nothing_but_our_cache_is_left_behind(scene, tmp_path):
     environment |= {"HOME": str(home), "TMPDIR": str(temporary)}
     photographs = ("--images", scene / "images", "--cameras", scene / "transforms.json")
     options = {"env": environment, "cwd": work}
-    made = call("idesplat.runtime.cli", *photographs, "--out", "scene.ply", "--render", "views", **options)
+    made = call("idesplat.runtime.cli", *photographs, "--out", "scene.ply", **options)
     assert made.returncode == 0, made.stderr
     assert {str(path.relative_to(home)) for path in home.glob("*/*")} == {".cache/idesplat"}
     assert not list(temporary.iterdir())
-    assert {path.name for path in work.iterdir()} == {"scene.ply", "views"}
+    assert {path.name for path in work.iterdir()} == {"scene.ply"}
+
+
+def test_compiled_code_is_kept_in_our_cache(tmp_path):
+    code = "import idesplat.runtime.rasterizer_compiled as compiled\nprint(compiled._project._cache.cache_path)\n"
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
+    environment["XDG_CACHE_HOME"] = str(tmp_path)
+    done = subprocess.run([sys.executable, "-P", "-c", code], env=environment, capture_output=True, text=True)
+    assert Path(done.stdout).is_relative_to(tmp_path / "idesplat" / "numba"), done.stderr
 
 
 @pytest.mark.parametrize("module", ["runtime.session", "runtime.openvino", "export.optimize", "tools.bench_products"])
@@ -222,6 +233,17 @@ def test_signals_clean_up(tmp_path, number, status):
     printed = waiting.communicate(timeout=60)
     assert (waiting.returncode, printed) == (status, ("", ""))
     assert not list(tmp_path.iterdir())
+
+
+def test_ctrl_c_while_a_command_is_loaded(tmp_path, monkeypatch, capsys):
+    from idesplat.runtime import launch
+
+    (tmp_path / "slow_to_load.py").write_text("raise KeyboardInterrupt")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(SystemExit) as stop:
+        launch._launch("slow_to_load")
+    assert stop.value.code == 130
+    assert capsys.readouterr() == ("", "")
 
 
 @POSIX
@@ -332,6 +354,48 @@ def test_warnings_of_libraries_are_not_shown(fail, status, expected):
     done = subprocess.run([sys.executable, "-P", "-c", NATIVE, fail], capture_output=True, text=True, timeout=60)
     assert done.returncode == status
     assert done.stderr.startswith(expected) and done.stderr.count("\n") == expected.count("error:")
+
+
+DECODING = """
+import sys
+from pathlib import Path
+import cv2
+from idesplat.runtime.errors import InputError
+from idesplat.runtime.terminal import run
+
+def decode(path: Path) -> None:
+    cv2.imread(str(path))
+    raise InputError("the one line")
+
+run(decode) if len(sys.argv) == 2 else cv2.imread(sys.argv[1])
+"""
+
+
+def test_warnings_of_image_decoders_are_not_shown(tmp_path):
+    """libjpeg's, of an image whose end is missing."""
+    path = tmp_path / "cut.jpg"
+    noise = np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)
+    path.write_bytes(cv2.imencode(".jpg", noise)[1].tobytes()[:-200])
+    command = [sys.executable, "-P", "-c", DECODING, path]
+    plain = subprocess.run([*command, "plainly"], capture_output=True, text=True, timeout=60)
+    assert "JPEG" in plain.stderr  # or else there is nothing to be kept off
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (2, "error: the one line\n")
+
+
+@POSIX
+@pytest.mark.parametrize("name", ["scene.splat", "scene.spz", "scene.ply", "scene.glb"])
+def test_files_larger_than_memory(tmp_path, name):
+    scene = tmp_path / name
+    if name.endswith("ply"):
+        columns = "".join(f"property float {column}\n" for column in COLUMNS)
+        header = f"ply\nformat binary_little_endian 1.0\nelement vertex 60000000000\n{columns}end_header\n"
+        scene.write_text(header)
+    with scene.open("ab") as file:
+        file.truncate(1 << 42)  # of which the disk holds nothing
+    done = call("idesplat.runtime.convert", scene, tmp_path / "out.splat")
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
 
 
 def test_messages_of_libraries_are_shown_beside_our_own_mistakes():
