@@ -61,7 +61,7 @@ def scratch_folder(parent: Path | None = None) -> Iterator[Path]:
     Raises OSError if the folder cannot be made.
     """
     parent = Path(parent or tempfile.gettempdir())
-    _collect_abandoned(parent)
+    collect_abandoned(parent)
     folder, lock = _make_locked(parent)
     try:
         yield folder
@@ -69,6 +69,18 @@ def scratch_folder(parent: Path | None = None) -> Iterator[Path]:
         if lock is not None:
             os.close(lock)  # before the file is removed: NFS and Windows keep files that are open
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def collect_abandoned(parent: Path) -> None:
+    """Remove the scratch folders that killed processes of this user left in `parent`; only when first asked to."""
+    if fcntl is None or parent in _collected:
+        return
+    _collected.add(parent)
+    with suppress(OSError), os.scandir(parent) as entries:
+        for entry in entries:
+            if SCRATCH_NAME.fullmatch(entry.name):
+                with suppress(OSError):
+                    _remove_if_abandoned(entry)
 
 
 def open_regular(path: Path) -> BinaryIO:
@@ -180,18 +192,6 @@ def _lock(descriptor: int) -> bool | None:
     except OSError:
         return None
     return True
-
-
-def _collect_abandoned(parent: Path) -> None:
-    """Remove the folders that this user's killed processes left in `parent`."""
-    if fcntl is None or parent in _collected:
-        return
-    _collected.add(parent)
-    with suppress(OSError), os.scandir(parent) as entries:
-        for entry in entries:
-            if SCRATCH_NAME.fullmatch(entry.name):
-                with suppress(OSError):
-                    _remove_if_abandoned(entry)
 
 
 def _remove_if_abandoned(entry: os.DirEntry[str]) -> None:

@@ -18,7 +18,7 @@ from typing import TypeVar
 
 import onnxruntime
 
-from .files import open_regular, scratch_folder
+from .files import collect_abandoned, open_regular, scratch_folder
 from .user_cache import cache_folder
 
 LAYOUT = 1
@@ -87,6 +87,7 @@ def place_for(model: Path) -> Place | None:
             return None
         folder = cache_folder("graphs")
         folder.mkdir(parents=True, exist_ok=True)
+        collect_abandoned(folder)
     except (OSError, RuntimeError):  # RuntimeError: there is no home folder
         return None
     made_for = [LAYOUT, onnxruntime.__version__, onnxruntime.get_build_info(), _processor()]

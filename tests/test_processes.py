@@ -484,6 +484,19 @@ def test_a_pipe_in_the_cache_is_replaced(tmp_path, monkeypatch):
 
 
 @POSIX
+def test_what_was_left_in_the_cache_is_collected(tmp_path, monkeypatch):
+    from idesplat.runtime import files, graph_cache
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    left = tmp_path / "idesplat" / "graphs" / f"{files.SCRATCH_PREFIX}abcdefgh"
+    left.mkdir(parents=True)
+    (left / files.LOCK_NAME).touch()
+    (left / "graph.onnx").write_bytes(b"half")
+    assert graph_cache.place_for(default_model()) is not None
+    assert not left.exists()
+
+
+@POSIX
 def test_a_pipe_in_a_colmap_model_is_refused(tmp_path):
     for name, text in MODEL.items():
         (tmp_path / name).write_text(text)
