@@ -4,7 +4,9 @@ import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
+from typing import Protocol
 
 from .errors import InputError, refuse
 
@@ -13,14 +15,29 @@ MOST_EXPANSION = 64
 ALWAYS_ALLOWED = 1 << 26  # bytes
 
 
+class WriteGuard(Protocol):
+    """What a running command asks before a file is written, and notes afterwards (see `outputs`)."""
+
+    def check(self, path: Path) -> None:
+        """Raise InputError where the file must not be written; create its folder where that is missing."""
+
+    def written(self, path: Path) -> None:
+        """Take note of a file that has just been written."""
+
+
+GUARD: ContextVar[WriteGuard | None] = ContextVar("GUARD", default=None)
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path` (same suffix) that replaces it once the block ends without an exception.
 
     A killed run leaves the old file or the new one, never half of one.
-    Raises InputError if the folder cannot be written.
+    Raises InputError if the folder cannot be written, or the running command must not replace the file.
     """
-    path = Path(path)
+    path, guard = Path(path), GUARD.get()
+    if guard is not None:
+        guard.check(path)
     try:
         handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
     except OSError as error:
@@ -32,6 +49,8 @@ def replacing(path: Path) -> Iterator[Path]:
         yield temporary
         temporary.chmod(0o666 & ~_umask())
         temporary.replace(path)
+        if guard is not None:
+            guard.written(path)
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror}; choose a file on a disk with room for it") from None
     finally:

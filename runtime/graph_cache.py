@@ -18,6 +18,8 @@ from typing import TypeVar
 
 import onnxruntime
 
+from .user_cache import cache_folder
+
 LAYOUT = 1
 SUFFIX = ".onnx"
 KEY_LENGTH = 32  # hexadecimal digits
@@ -85,7 +87,7 @@ def place_for(model: Path) -> Place | None:
         content = model.read_bytes()
         if EXTERNAL in content:  # those files' content would have to be part of the key
             return None
-        folder = _folder()
+        folder = cache_folder("graphs")
         folder.mkdir(parents=True, exist_ok=True)
     except (OSError, RuntimeError):  # RuntimeError: there is no home folder
         return None
@@ -93,12 +95,6 @@ def place_for(model: Path) -> Place | None:
     digest = hashlib.sha256(json.dumps(made_for).encode())
     digest.update(content)
     return Place(folder, digest.hexdigest()[:KEY_LENGTH])
-
-
-def _folder() -> Path:
-    """Ours in the user's cache folder."""
-    given = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
-    return (Path(given) if given else Path.home() / ".cache") / "idesplat" / "graphs"
 
 
 def _processor() -> str:
