@@ -81,10 +81,11 @@ class Outputs:
                     self._refuse_input(*self._outputs[key], path, what)
                 self._inputs.setdefault(key, (path, what))
 
-    def writes(self, option: str, paths: Iterable[Path]) -> None:
+    def writes(self, option: str, paths: Iterable[Path], known: bool = False) -> None:
         """Announce files that the run will write, and the option that asks for them.
 
-        Raises InputError, before anything is written, if one of them must not be or cannot be.
+        known: existing ones are known to be of this run, by what stands in them.
+        Raises InputError, before anything is written, if one of them must not be written, or cannot be.
         """
         strangers = []
         for path in paths:
@@ -95,7 +96,7 @@ class Outputs:
                 if key in self._inputs:
                     self._refuse_input(path, option, *self._inputs[key])
             self._add(option, path, keys)
-            if existing and not self.overwrite and self.writer_of(path) is None:
+            if existing and not (known or self.overwrite) and self.writer_of(path) is None:
                 strangers.append(path)
         if strangers:
             others = f" (and {len(strangers) - 1} more)" if len(strangers) > 1 else ""
@@ -166,9 +167,7 @@ class Outputs:
         self._checked.add(folder)
 
     def _refuse_input(self, path: Path, option: str, source: Path, what: str) -> None:
-        raise InputError(
-            f"{_named(option)}{path}: would replace {what} that this run is about, {source}; choose another name"
-        )
+        raise InputError(f"{_named(option)}{path}: would replace {what}, {source}; choose another name")
 
 
 _CURRENT: ContextVar[Outputs | None] = ContextVar("_CURRENT", default=None)

@@ -41,7 +41,7 @@ def read_record(folder: Path) -> dict[str, WrittenFile]:
             lines = record.read_text("ascii", errors="replace").splitlines()
     for line in lines:
         # A line that was cut short, or damaged, is none.
-        with suppress(ValueError, TypeError, KeyError):
+        with suppress(ValueError, TypeError, OverflowError, RecursionError):
             name, command, size, changed_ns = json.loads(line)
             if isinstance(name, str):
                 found[name] = WrittenFile(str(command), int(size), int(changed_ns))
