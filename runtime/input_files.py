@@ -17,10 +17,9 @@ IMAGE_FOLDERS = ("", "images", "input")
 
 def model_files(model: Path) -> list[Path]:
     """A model with the files of its weights, or all files of a staged folder; none where there is none."""
-    if model.is_dir():
-        return [path for path in model.iterdir() if path.is_file()]
-    beside = (path for path in model.parent.glob(f"{glob.escape(model.name)}*data") if path.is_file())
-    return [model, *beside]
+    if os.path.isdir(model):
+        return [path for path in _children(model) if os.path.isfile(path)]
+    return [model, *(Path(name) for name in glob.glob(f"{glob.escape(str(model))}*data"))]
 
 
 def camera_files(cameras: Path) -> list[Path]:
@@ -28,7 +27,7 @@ def camera_files(cameras: Path) -> list[Path]:
     from . import cameras_colmap, cameras_dtu, cameras_llff, cameras_opencv, cameras_transforms
     from .cameras import COLMAP_PARTS
 
-    if not cameras.is_dir():
+    if not os.path.isdir(cameras):
         found = [cameras]
         if cameras.stem in cameras_opencv.OTHER_HALF:
             found.append(cameras.with_stem(cameras_opencv.OTHER_HALF[cameras.stem]))
@@ -38,8 +37,8 @@ def camera_files(cameras: Path) -> list[Path]:
         found += cameras_dtu.files_in(cameras)
         folder = cameras
     if folder is not None:
-        found += [path for model in cameras_colmap.models_in(folder) for path in model.iterdir()]
-    return [path for path in found if path.is_file()]
+        found += [path for model in cameras_colmap.models_in(folder) for path in _children(model)]
+    return [path for path in found if os.path.isfile(path)]
 
 
 def given_images(given: Sequence[str | Path]) -> list[Path]:
@@ -49,9 +48,9 @@ def given_images(given: Sequence[str | Path]) -> list[Path]:
     found: list[Path] = []
     for item in given:
         path = Path(item)
-        if path.is_dir():
-            found += [child for child in path.iterdir() if child.suffix.lower() in SUFFIXES]
-        elif path.exists():
+        if os.path.isdir(path):
+            found += [child for child in _children(path) if child.suffix.lower() in SUFFIXES]
+        elif os.path.exists(path):
             found.append(path)
         else:
             found += [Path(name) for name in glob.glob(str(item), recursive=True)]
@@ -63,7 +62,7 @@ def named_images(path: Path, cameras: Iterable["Camera"]) -> list[Path]:
 
     path: the file or folder that the cameras were read from.
     """
-    folder = path if path.is_dir() else path.parent
+    folder = path if os.path.isdir(path) else path.parent
     return [folder / _posix(camera.name) for camera in cameras]
 
 
@@ -78,15 +77,22 @@ def nearby_images(path: Path, cameras: Iterable["Camera"]) -> list[Path]:
     for camera in cameras:
         name = _posix(camera.name)
         stems_in[name.parent].add(stem(name))
-    folder = Path(os.path.abspath(path if path.is_dir() else path.parent))
+    folder = Path(os.path.abspath(path if os.path.isdir(path) else path.parent))
     roots = [folder, *folder.parents][: 1 + LEVELS_UP]
     found = []
     for below, stems in stems_in.items():
         for place in dict.fromkeys(root / name / below for root in roots for name in IMAGE_FOLDERS):
-            if place.is_dir():
-                children = (child for child in place.iterdir() if child.suffix.lower() in SUFFIXES)
-                found += [child for child in children if stem(child) in stems]
+            children = (child for child in _children(place) if child.suffix.lower() in SUFFIXES)
+            found += [child for child in children if stem(child) in stems]
     return found
+
+
+def _children(folder: Path) -> list[Path]:
+    """What a folder holds; nothing where it cannot be read, or is none."""
+    try:
+        return list(folder.iterdir())
+    except (OSError, ValueError):
+        return []
 
 
 def _posix(name: str) -> PurePosixPath:

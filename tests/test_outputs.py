@@ -405,3 +405,27 @@ def test_outside_of_a_command_nothing_is_kept(tmp_path, capsys):
 )
 def test_names_of_files(images, endings, expected):
     assert name_files(images, endings) == expected
+
+
+# ---- a wrong file: the message lists what is read
+
+
+@pytest.mark.parametrize(
+    ("main", "arguments", "expected"),
+    [
+        (infer, ("--images", "transforms.json", "--cameras", "transforms.json"), (".jpg", ".png", ".webp")),
+        (infer, ("--images", "images", "--cameras", "images/000.png"), ("transforms.json", "COLMAP", "RealEstate10K")),
+        (infer, ("--images", "images", "--cameras", "images"), ("transforms.json", "COLMAP", "poses_bounds.npy")),
+        (render, ("images/000.png",), (".ply", ".splat", ".spz", ".sog", ".glb")),
+        (render, ("scene.ply", "--cameras", "images/000.png"), ("transforms.json", "COLMAP", "RealEstate10K")),
+        (convert, ("images/000.png",), (".ply", ".splat", ".spz", ".sog", ".glb")),
+        (view, ("images/000.png",), (".ply", ".splat", ".spz", ".sog", ".glb")),
+        (view, ("scene.ply", "--cameras", "transforms.json", "--images", "scene.ply"), (".jpg", ".png", ".webp")),
+        (cameras_main, ("convert", "scene.ply"), ("transforms.json", "COLMAP", "RealEstate10K")),
+    ],
+)
+def test_a_wrong_file_is_told_what_is_read(dataset, capfd, main, arguments, expected):
+    out = {convert: ["new.ply"], cameras_main: ["new.json"], view: ["--html", "new.html"], infer: ["--out", "new.ply"]}
+    line = refused(capfd, dataset, main, *arguments, *out.get(main, ["--out", "new"]))
+    assert all(text in line for text in expected)
+    assert main not in (convert, render, view) or ".obj" not in line  # which is written, not read
