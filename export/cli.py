@@ -12,7 +12,7 @@ import typer
 
 from ..runtime.bundle import MANIFEST_NAME, Description, StageFile, write_manifest
 from ..runtime.errors import InputError, exit_on_input_error
-from ..runtime.files import check_writable, make_folder
+from ..runtime.outputs import Overwrite, guards_outputs, outputs
 from ..runtime.sizes import parse_size, size_fits, size_rule
 from ..runtime.terminal import run, say, warn
 
@@ -25,6 +25,7 @@ PARITY_BREACH = 1
 
 
 @exit_on_input_error
+@guards_outputs("idesplat-export")
 def export(
     checkpoint: Annotated[
         Path, typer.Argument(help="Released checkpoint: .ckpt, .pth or .safetensors.", show_default=False)
@@ -39,11 +40,13 @@ def export(
     precision: Annotated[
         str, typer.Option(help="float32, int8 (for processors) or fp16 (for graphics cards).")
     ] = "float32",
+    overwrite: Overwrite = False,
 ) -> None:
     """Write a checkpoint as a standard ONNX graph (opset 20), and prove that it computes the same.
 
     Views, height and width stay dynamic unless fixed by --views and --size.
     """
+    outputs().reads("the checkpoint", [checkpoint])
     folder = _check_targets(out, staged)
     if find_spec("torch") is None or find_spec("onnx") is None:
         raise InputError("exporting needs PyTorch and onnx, which are not installed; pip install 'idesplat[export]'")
@@ -77,13 +80,15 @@ def _check_targets(out: Path | None, staged: Path | None) -> Path:
     if out is not None:
         if out.suffix != ".onnx":
             raise InputError(f"{out}: the output must end in .onnx")
-        check_writable(out.parent)
+        outputs().writes("", [out])
+        outputs().make_folder(out.parent)
     if staged is not None:
         if staged.exists() and not staged.is_dir():
             raise InputError(f"--staged {staged}: is a file, expected a folder")
         if staged.is_dir() and any(staged.iterdir()) and not (staged / MANIFEST_NAME).is_file():
             raise InputError(f"--staged {staged}: holds other files; choose an empty or new folder")
-        check_writable(make_folder(staged.parent))
+        outputs().writes_into("--staged", staged)
+        outputs().make_folder(staged.parent)
     return folders[0]
 
 

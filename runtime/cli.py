@@ -1,18 +1,20 @@
 """The command idesplat-infer: photographs and cameras to a splat file, depth maps and views."""
 
 import json
+import os
 import shlex
 import time
-from collections import Counter
+from contextlib import suppress
 from dataclasses import asdict, replace
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from .camera_format import ESTIMATE, CameraFormat
 from .errors import InputError, exit_on_input_error
-from .files import check_writable, make_folder, replacing
+from .files import replacing
+from .outputs import STANDARD_OUTPUT, Overwrite, guards_outputs, name_files, outputs, write_json
 from .terminal import run, say
 
 if TYPE_CHECKING:
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
 
     import numpy as np
 
+    from .cameras import Camera
     from .cleaning import Cleaning
     from .depth_range import DepthRange
     from .inputs import Inputs, Request
@@ -28,8 +31,11 @@ if TYPE_CHECKING:
 
 # Frames of the path that --render draws from the first view to the last.
 PATH_FRAMES = 24
+DEPTH_ENDINGS = (".png", ".npz")  # of a depth map to look at, and of a metric one
 # What the folder's name ends in where a model that predicts depth alone is not told where to.
 DEPTH_FOLDER = "-depth"
+# Beside the scene, the cameras that were estimated for it.
+ESTIMATED_CAMERAS = ".cameras.json"
 OUT_HELP = (
     "Splats: .ply, .compressed.ply, .splat, .spz, .sog, .glb. Points: .points.ply, .points.glb, .xyz, .obj. "
     "Surfaces: .mesh.ply, .mesh.glb, .mesh.obj."
@@ -38,6 +44,7 @@ CLEANING = "Cleaning (off unless asked for)"
 
 
 @exit_on_input_error
+@guards_outputs("idesplat-infer")
 def infer(
     images: Annotated[
         list[Path], typer.Option(help="Folder, glob or files of photographs, or a video.", show_default=False)
@@ -67,7 +74,7 @@ def infer(
         typer.Option(help="How many photographs to use, the best placed ones: 2, or all --frames.", min=2),
     ] = None,
     frames: Annotated[
-        str | None, typer.Option(help="Photographs to use: names or numbers from 0, with commas between.")
+        str | None, typer.Option(help="Photographs to use: names, numbers from 0, 0-3 or 0:8:2, with commas between.")
     ] = None,
     size: Annotated[str | None, typer.Option(help="HEIGHTxWIDTH to work at instead of the trained size.")] = None,
     near: Annotated[float | None, typer.Option(help="Nearest depth in scene units, else found.")] = None,
@@ -102,13 +109,20 @@ def infer(
         ),
     ] = False,
     save_cameras: Annotated[
-        Path | None, typer.Option(help="Write the photographs' cameras: our own JSON, or transforms.json if named so.")
+        Path | None,
+        typer.Option(
+            help="Write the photographs' cameras: our own JSON, or transforms.json if named so. Estimated ones are "
+            "kept in any case, beside the scene."
+        ),
     ] = None,
     report: Annotated[
         Path | None, typer.Option(help="Write one .html that shows views, depth, confidence, timings and settings.")
     ] = None,
     timings: Annotated[bool, typer.Option("--timings", help="Print seconds by stage.")] = False,
-    json_path: Annotated[Path | None, typer.Option("--json", help="Write a summary as JSON.")] = None,
+    json_path: Annotated[
+        Path | None, typer.Option("--json", help="Write a summary as JSON, to standard output if it is -.")
+    ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Turn posed photographs into a 3D Gaussian splat that every viewer opens."""
     from .cameras import write_cameras
@@ -120,16 +134,23 @@ def infer(
     from .runner import Runner
 
     started = time.perf_counter()
-    _check_outputs(out, (json_path, save_cameras, report), (save_depth, render))
+    given = Request([*images, *(more_images or [])], cameras, camera_format, focal, frames, views, size)
+    if cameras == ESTIMATE and save_cameras is None:
+        save_cameras = _beside(out, ESTIMATED_CAMERAS)
+    model = model or default_model()
+    files = {"--out": out, "--json": json_path, "--save-cameras": save_cameras, "--report": report}
+    _announce(given, model, files, {"--save-depth": save_depth, "--render": render})
     _check_range(near, far)
     cleaning = Cleaning(min_opacity, trim_border, trim_edges, min_confidence, merge_duplicates)
-    given = Request([*images, *(more_images or [])], cameras, camera_format, focal, frames, views, size)
     with working("loading the model"):
-        runner = Runner(model or default_model(), provider)
+        runner = Runner(model, provider)
     _check_fit(runner, out, cleaning, {"--render": render, "--report": report})
     preparing = time.perf_counter()
     inputs = read_inputs(given, runner)
     prepared = inputs.views
+    if not runner.description.gaussians and save_depth is None:  # depth maps are what such a model is for
+        save_depth = _beside(out, DEPTH_FOLDER)
+    _announce_pictures(given, inputs, save_depth, render)
     with working("finding near and far"):
         span = runner.depth_range(prepared, near, far)
     predicting = time.perf_counter()
@@ -139,12 +160,11 @@ def infer(
     if cleaning.asked and not is_surface(out):
         prediction, cleaned = _clean(prediction, prepared, cleaning)
     _write_scene(prediction, prepared, out, cleaning)
-    if prediction.gaussians is None and save_depth is None:  # depth maps are what such a model is for
-        save_depth = make_folder(out.with_name(out.name.partition(".")[0] + DEPTH_FOLDER))
     pictures = _write_pictures(prediction, prepared, save_depth, render)
     written = [out]
     if save_cameras is not None:
-        write_cameras(save_cameras, inputs.cameras)
+        found = inputs.cameras
+        write_cameras(save_cameras, _named_from(save_cameras.parent, found) if cameras == ESTIMATE else found)
         written.append(save_cameras)
     seconds = {"load": runner.load_seconds, "prepare": predicting - preparing, **prediction.seconds}
     seconds |= {"write": time.perf_counter() - writing, "total": time.perf_counter() - started}
@@ -157,14 +177,14 @@ def infer(
         written.append(report)
         summary["files"].append(str(report))
     if json_path is not None:
-        with replacing(json_path) as temporary:
-            temporary.write_text(json.dumps(summary, indent=2) + "\n")
-        written.append(json_path)
+        write_json(json_path, json.dumps(summary, indent=2))
+        if json_path != STANDARD_OUTPUT:
+            written.append(json_path)
     for note in inputs.notes:
         say(note)
     say(f"near {span.near:.4g} and far {span.far:.4g}, in the cameras' unit: {span.source}")
     for path in written:
-        say(f"wrote {path}")
+        say(f"wrote {path}{_described(path, prediction, seconds) if path == out else ''}")
     _say_pictures(len(prepared.names), save_depth, render)
     if prediction.gaussians is not None and holds_splats(out):
         _say_how_to_look(out, given, save_cameras)
@@ -189,34 +209,97 @@ def _say_pictures(views: int, save_depth: Path | None, render: Path | None) -> N
 
 
 def _say_how_to_look(out: Path, given: "Request", save_cameras: Path | None) -> None:
-    """Commands to copy. Cameras that were found are of use only where they were kept."""
-    cameras: list[str] = []
-    if given.cameras != ESTIMATE:
+    """Commands to copy, with the cameras that were given, or those that were found and kept."""
+    if given.cameras == ESTIMATE:
+        cameras = ["--cameras", str(save_cameras)]
+    else:
         form = ["--camera-format", given.camera_format] if given.camera_format else []
         cameras = ["--cameras", given.cameras, *form]
-    elif save_cameras is not None:
-        cameras = ["--cameras", str(save_cameras)]
-    photographs = ["--images", str(given.images[0])] if cameras and len(given.images) == 1 else []
+    photographs = ["--images", str(given.images[0])] if len(given.images) == 1 else []
     say(f"open {out} in any splat viewer (SuperSplat, for one), look at it in the browser, or draw it:")
     say("    " + shlex.join(["idesplat-view", str(out), *cameras, *photographs]))
     say("    " + shlex.join(["idesplat-render", str(out), *cameras, "--out"]) + " DIR")
-    if not cameras:
-        say("    (--save-cameras FILE.json keeps the cameras that were found, to be given here as --cameras)")
 
 
-def _check_outputs(out: Path, files: "Sequence[Path | None]", folders: "Sequence[Path | None]") -> None:
-    """Find out before the work whether the results can be written."""
+def _beside(out: Path, ending: str) -> Path:
+    """A path beside the scene, called like it but for the ending."""
     from .formats import scene_suffix
 
-    scene_suffix(out)
-    for path in (out, *files):
-        if path is not None:
-            if path.is_dir():
-                raise InputError(f"{path}: is a folder, expected a file to write")
-            check_writable(path.parent)
-    for folder in folders:
+    return out.with_name(out.name[: -len(scene_suffix(out))] + ending)
+
+
+def _announce(
+    given: "Request", model: Path, files: "dict[str, Path | None]", folders: "dict[str, Path | None]"
+) -> None:
+    """Say, before the work, what is read and what is to be written; raises InputError where that does not go together.
+
+    files, folders: what is to be written, by option.
+    """
+    from .formats import scene_suffix
+    from .input_files import camera_files, given_images, model_files
+
+    run = outputs()
+    run.reads("the model", model_files(model))
+    run.reads("a photograph", given_images(given.images))
+    if given.cameras != ESTIMATE:
+        run.reads("the cameras", camera_files(Path(given.cameras)))
+    if files["--out"] is not None:
+        scene_suffix(files["--out"])
+    for option, path in files.items():
+        if path is not None and not (option == "--json" and path == STANDARD_OUTPUT):
+            run.writes(option, [path])
+    for option, folder in folders.items():
         if folder is not None:
-            check_writable(make_folder(folder))
+            run.writes_into(option, folder)
+
+
+def _announce_pictures(given: "Request", inputs: "Inputs", save_depth: Path | None, render: Path | None) -> None:
+    """Say what is written into folders, now that the views are chosen; raises InputError as `_announce`."""
+    from .input_files import named_images
+
+    run, stems = outputs(), _stems(inputs.views)
+    if given.cameras != ESTIMATE:
+        run.reads("a photograph", named_images(Path(given.cameras), inputs.cameras))
+    if save_depth is not None:
+        run.writes("--save-depth", [save_depth / (stem + ending) for stem in stems for ending in DEPTH_ENDINGS])
+    if render is not None:
+        run.writes("--render", [render / name for name in (*map(_view_name, stems), *_path_names())])
+
+
+def _stems(views: "Views") -> list[str]:
+    """What the files that are made of the views are called, but for their endings."""
+    return name_files([camera.name for camera in views.cameras])
+
+
+def _view_name(stem: str) -> str:
+    return f"view-{stem}.png"
+
+
+def _path_names() -> list[str]:
+    """The frames of the path through the views."""
+    return [f"path-{index:03d}.png" for index in range(PATH_FRAMES)]
+
+
+def _named_from(folder: Path, cameras: "Sequence[Camera]") -> "list[Camera]":
+    """The cameras, their images named as seen from a folder, where they are files; a frame of a video is none."""
+    named = []
+    for camera in cameras:
+        if Path(camera.name).is_file():
+            name = os.path.realpath(camera.name)
+            with suppress(ValueError):  # on another drive of Windows
+                name = os.path.relpath(name, os.path.realpath(folder))
+            camera = replace(camera, name=Path(name).as_posix())
+        named.append(camera)
+    return named
+
+
+def _described(out: Path, prediction: "Prediction", seconds: dict[str, float]) -> str:
+    """What the file of the scene holds, how large it is and how long it took, as the end of a line."""
+    from .formats import holds_splats
+
+    splats = prediction.gaussians if holds_splats(out) else None
+    count = "" if splats is None else f"{len(splats):,} Gaussians, "
+    return f": {count}{out.stat().st_size / 1e6:.1f} MB, in {seconds['total']:.1f} s"
 
 
 def _check_fit(runner: "Runner", out: Path, cleaning: "Cleaning", drawn: dict[str, Path | None]) -> None:
@@ -285,20 +368,13 @@ def _write_pictures(
     prediction: "Prediction", views: "Views", save_depth: Path | None, render: Path | None
 ) -> list[Path]:
     """Write depth maps and drawn views, where asked for; the paths written."""
-    stems = _stems(views.names)
+    stems = _stems(views)
     written = []
     if save_depth is not None:
         written += _write_depth(prediction.depth, stems, save_depth)
     if render is not None:
         written += _write_renders(prediction, views, stems, render)
     return written
-
-
-def _stems(names: list[str]) -> list[str]:
-    """File names without suffix, with the view's number in front where two are the same."""
-    stems = [PurePath(name).stem for name in names]
-    counts = Counter(stems)
-    return [stem if counts[stem] == 1 else f"{index}-{stem}" for index, stem in enumerate(stems)]
 
 
 def _write_depth(depth: "np.ndarray", stems: list[str], folder: Path) -> list[Path]:
@@ -309,7 +385,7 @@ def _write_depth(depth: "np.ndarray", stems: list[str], folder: Path) -> list[Pa
 
     written = []
     for stem, values in zip(stems, depth, strict=True):
-        picture, metric = folder / f"{stem}.png", folder / f"{stem}.npz"
+        picture, metric = (folder / (stem + ending) for ending in DEPTH_ENDINGS)
         save_depth_png(picture, values)
         with replacing(metric) as temporary:
             np.savez_compressed(temporary, depth=values)
@@ -329,9 +405,9 @@ def _write_renders(prediction: "Prediction", views: "Views", stems: list[str], f
     gaussians = prediction.need_gaussians()
     height, width = prediction.depth.shape[1:]
     K = views.intrinsics.astype(np.float64) * np.array([width, height, 1.0])[:, None]  # [views, 3, 3]
-    shots = [(f"view-{stem}.png", pose, k) for stem, pose, k in zip(stems, views.extrinsics, K, strict=True)]
+    shots = [(_view_name(stem), pose, k) for stem, pose, k in zip(stems, views.extrinsics, K, strict=True)]
     path = interpolate_extrinsics(views.extrinsics, PATH_FRAMES)
-    shots += [(f"path-{index:03d}.png", pose, K.mean(axis=0)) for index, pose in enumerate(path)]
+    shots += [(name, pose, K.mean(axis=0)) for name, pose in zip(_path_names(), path, strict=True)]
     written = []
     for name, pose, k in progress(shots, "drawing views"):
         save_png(folder / name, draw_view(gaussians, pose, k, width, height).rgb)

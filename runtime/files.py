@@ -7,8 +7,9 @@ import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Protocol
 
 from .errors import InputError, refuse
 
@@ -34,19 +35,36 @@ KINDS = {
 _collected: set[Path] = set()
 
 
+class WriteGuard(Protocol):
+    """What a running command asks before a file is written, and notes afterwards (see `outputs`)."""
+
+    def check(self, path: Path) -> None:
+        """Raise InputError where the file must not be written; create its folder where that is missing."""
+
+    def written(self, path: Path) -> None:
+        """Take note of a file that has just been written."""
+
+
+GUARD: ContextVar[WriteGuard | None] = ContextVar("GUARD", default=None)
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary path of the same name that replaces `path` once the block ends without an exception.
 
     A killed run leaves the old file or the new one, never half of one.
-    Raises InputError if the folder cannot be written.
+    Raises InputError if the folder cannot be written, or the running command must not replace the file.
     """
-    path = Path(path)
+    path, guard = Path(path), GUARD.get()
+    if guard is not None:
+        guard.check(path)
     try:
         with scratch_folder(path.parent) as folder:
             temporary = folder / path.name
             yield temporary
             temporary.replace(path)
+        if guard is not None:
+            guard.written(path)
     except OSError as error:
         reason = f"cannot write {path}: {error.strerror or error}"
         raise InputError(f"{reason}; choose a folder that exists, is writable and has room for it") from None

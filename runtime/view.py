@@ -10,6 +10,7 @@ import typer
 
 from .cameras import CameraFormat
 from .errors import InputError, Terminated, exit_on_input_error
+from .outputs import Overwrite, guards_outputs, outputs
 from .terminal import run, say
 
 if TYPE_CHECKING:
@@ -21,6 +22,7 @@ PORT = 8080
 
 
 @exit_on_input_error
+@guards_outputs("idesplat-view")
 def view(
     scene: Annotated[Path, typer.Argument(help="Splat file of any format.", show_default=False)],
     cameras: Annotated[Path | None, typer.Option(help="Cameras to draw, such as a transforms.json.")] = None,
@@ -38,6 +40,7 @@ def view(
     host: Annotated[str, typer.Option(help="Address to serve at; other machines do not see the default.")] = LOOPBACK,
     port: Annotated[int, typer.Option(help="Port to serve at, 0 for any.", min=0, max=65535)] = PORT,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
+    overwrite: Overwrite = False,
 ) -> None:
     """Look at a splat file in the browser, from the first camera, with the cameras and their photographs around it.
 
@@ -49,7 +52,7 @@ def view(
     if images and cameras is None:
         raise InputError("--images: needs the cameras that took them; give --cameras")
     if html is not None:
-        _check_page(html)
+        _check_page(html, scene, cameras, [*(images or []), *(more_images or [])])
     gaussians = read_scene(scene)
     viewpoints = read_viewpoints(cameras, camera_format, [*(images or []), *(more_images or [])])
     if html is None:
@@ -91,13 +94,17 @@ def _until_interrupted() -> Iterator[None]:
         return
 
 
-def _check_page(html: Path) -> None:
-    """Find out before the work whether the page can be written."""
-    from .files import check_writable
+def _check_page(html: Path, scene: Path, cameras: Path | None, images: list[Path]) -> None:
+    """Find out before the work whether the page can be written, and is none of the files to read."""
+    from .input_files import camera_files, given_images
 
     if html.suffix.lower() not in (".html", ".htm") or html.is_dir():
         raise InputError(f"--html {html}: expected a file to write, whose name ends in .html")
-    check_writable(html.parent)
+    run = outputs()
+    run.reads("the scene", [scene])
+    run.reads("the cameras", camera_files(cameras) if cameras else [])
+    run.reads("a photograph", given_images(images))
+    run.writes("--html", [html])
 
 
 def read_viewpoints(cameras: Path | None, form: CameraFormat | None, images: list[Path]) -> "list[Viewpoint]":

@@ -11,7 +11,8 @@ from rich.console import Console
 from rich.table import Table
 
 from ..runtime.errors import InputError
-from ..runtime.files import read_bytes, replacing
+from ..runtime.files import read_bytes
+from ..runtime.outputs import write_json
 
 WIDTH = 150  # columns, where there is no terminal to ask
 SHOWN = 7  # operators of a row
@@ -97,8 +98,7 @@ def print_rows(rows: Sequence[Row]) -> None:
 
 def write_rows(path: Path, machine: dict[str, Any], rows: Sequence[Row]) -> None:
     """Write everything that was measured as JSON."""
-    with replacing(path) as temporary:
-        temporary.write_text(json.dumps({"machine": machine, "rows": [asdict(row) for row in rows]}, indent=1) + "\n")
+    write_json(path, json.dumps({"machine": machine, "rows": [asdict(row) for row in rows]}, indent=1))
 
 
 def read_rows(path: Path) -> list[Row]:

@@ -1,6 +1,6 @@
 """The command idesplat-eval: how well an exported model draws views that it was not given, in the field's measures."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 from functools import partial
 from importlib.util import find_spec
@@ -11,7 +11,8 @@ import typer
 
 from ..runtime.default_model import default_model
 from ..runtime.errors import InputError, exit_on_input_error
-from ..runtime.files import check_writable, make_folder
+from ..runtime.input_files import camera_files, model_files
+from ..runtime.outputs import Overwrite, guards_outputs, name_files, outputs
 from ..runtime.sizes import parse_size
 from ..runtime.terminal import run, say
 
@@ -43,6 +44,7 @@ app = typer.Typer(add_completion=False, no_args_is_help=True, help=__doc__)
 
 @app.command()
 @exit_on_input_error
+@guards_outputs("idesplat-eval")
 def scene(
     images: Annotated[Path, typer.Argument(help="Folder of photographs.", show_default=False)],
     cameras: Annotated[Path, typer.Option(help="Their cameras, such as a transforms.json.", show_default=False)],
@@ -56,6 +58,7 @@ def scene(
     size: Size = None,
     near: Near = None,
     far: Far = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Hold photographs out, infer from others, and compare; beside the nearest photograph and the best plane."""
     from ..runtime.cameras import read_cameras
@@ -68,7 +71,7 @@ def scene(
 
     found = find_images([images])
     frames = match(found, read_cameras(cameras, found))
-    runner = _runner(model, out)
+    runner = _runner(model, out, [*found, *camera_files(cameras)])
     chosen = chosen_frames(frames, context or [], target or [], runner.description.fixed_views or views, hold_out_every)
     shape = parse_size(size) if size else runner.size_for([camera for _, camera in frames])
     for sources, held_out in chosen:
@@ -85,6 +88,7 @@ def scene(
 
 @app.command()
 @exit_on_input_error
+@guards_outputs("idesplat-eval")
 def chunks(
     folder: Annotated[Path, typer.Argument(help="Folder of .torch chunks.", show_default=False)],
     index: Annotated[Path, typer.Option(help="The published evaluation index (.json).", show_default=False)],
@@ -92,6 +96,7 @@ def chunks(
     model: Model = None,
     near: Near = None,
     far: Far = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Evaluate on RealEstate10K, ACID or DL3DV as the papers do: pixelSplat's chunks, a published index of frames."""
     from .chunks import NEAREST_DRAWN, chunk_cases, find_chunks, read_index
@@ -100,7 +105,7 @@ def chunks(
     from .report import print_means
 
     entries, files = read_index(index), find_chunks(folder)
-    runner = _runner(model, out)
+    runner = _runner(model, out, [index, *files])
     own = runner.description
     for views in sorted({len(entry.context) for entry in entries.values()}):
         runner.check_size(views, own.height, own.width)
@@ -132,6 +137,7 @@ def chunks(
 
 @app.command()
 @exit_on_input_error
+@guards_outputs("idesplat-eval")
 def procedural(
     out: Out,
     model: Model = None,
@@ -144,6 +150,7 @@ def procedural(
         typer.Option(help="Context views there are, of which --views are given; to compare."),
     ] = None,
     size: Size = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Evaluate on the held-out procedural scenes: depth against the truth, and novel views (extra `eval`)."""
     if find_spec("numba") is None:
@@ -156,7 +163,7 @@ def procedural(
     from .report import print_means
     from .scenes import HELD_OUT_SEEDS
 
-    runner = _runner(model, out)
+    runner = _runner(model, out, [])
     shape = parse_size(size) if size else (runner.description.height, runner.description.width)
     runner.check_size(views, *shape)
     drawn = views if drawn is None else drawn
@@ -182,13 +189,21 @@ def _by(shape: tuple[int, int]) -> str:
     return f"{shape[0]}x{shape[1]}"
 
 
-def _runner(model: Path | None, out: Path) -> "Runner":
-    """The model, once it is known that results can be written."""
-    from ..runtime.runner import Runner
+def _runner(model: Path | None, out: Path, data: Sequence[Path]) -> "Runner":
+    """The model, once it is known that results can be written, and will replace nothing of the data or the user.
 
-    runner = Runner(model or default_model())
-    check_writable(make_folder(out))
-    return runner
+    Pictures are named after scenes, which may not be known yet, so any that is there counts as one to be replaced.
+    """
+    from ..runtime.runner import Runner
+    from .report import RESULTS
+
+    path = model or default_model()
+    run = outputs()
+    run.reads("the model", model_files(path))
+    run.reads("data", data)
+    run.writes_into("--out", out)
+    run.writes("--out", [out / RESULTS, *out.glob("*.png")])
+    return Runner(path)
 
 
 def _evaluate(
@@ -210,8 +225,8 @@ def _evaluate(
             if skip is None:
                 raise
             skip(case.name, str(error))
-        for target, strip in strips.items():
-            save_png(out / f"{case.name}-{Path(target).stem}.png", strip)
+        for name, strip in zip(name_files(list(strips)), strips.values(), strict=True):
+            save_png(out / f"{case.name}-{name}.png", strip)
     return results
 
 
