@@ -250,7 +250,7 @@ def _predict(views: "Views", runner: "Runner", span: "DepthRange") -> "Predictio
     from .progress import working
 
     with working("predicting depth and Gaussians"):
-        return runner.predict_arrays(views.images, views.extrinsics, views.intrinsics, span.near, span.far)
+        return runner.predict_views(views, span.near, span.far)
 
 
 def _clean(prediction: "Prediction", views: "Views", cleaning: "Cleaning") -> "tuple[Prediction, dict[str, int]]":
