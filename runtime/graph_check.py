@@ -133,7 +133,7 @@ def check_results(values: Mapping[str, object], views: int, height: int, width: 
         if not finite.all():
             share = 100 * (1 - finite.mean())
             raise InputError(
-                f"the graph yields NaN or infinity in {share:.2g} % of {name}: its weights are damaged, or its "
+                f"the graph yields NaN or infinity in {share:.3g} % of {name}: its weights are damaged, or its "
                 f"precision ({shown(own.precision)}) does not hold its numbers; export it again, in float32"
             )
     _check_signs(values, own)
@@ -184,9 +184,10 @@ def _fits(found: Sequence[int | str | None], expected: Sequence[int | None], exa
     """
     if not found and not exactly:  # ONNX Runtime's word for a shape that is not known
         return True
-    return len(found) == len(expected) and all(
-        not isinstance(a, int) or a == b or (b is None and not exactly) for a, b in zip(found, expected, strict=True)
-    )
+    sizes = [size if isinstance(size, int) else None for size in found]
+    if exactly:
+        return sizes == list(expected)
+    return len(sizes) == len(expected) and all(None in (a, b) or a == b for a, b in zip(sizes, expected, strict=True))
 
 
 def _words(shape: Sequence[int | str | None]) -> str:

@@ -201,13 +201,31 @@ class Runner:
         turn = upright and own.width > own.height and not own.fixed_size
         return (own.width, own.height) if turn else (own.height, own.width)
 
+    def view_count(self, asked: int | None, named: int | None, default: int | None) -> int | None:
+        """How many views to use; None for all.
+
+        asked: by --views. named: how many images --frames names. default: where neither says so, and the model takes
+        any number.
+        Raises InputError where the model was exported for a number of views, and another is asked for.
+        """
+        fixed = self.description.fixed_views
+        if not fixed:
+            return asked or (None if named else default)
+        if asked is not None and asked != fixed:
+            raise InputError(f"--views {asked}: {self._fixed()}; use --views {fixed}, or export without --views")
+        if named is not None and (named < fixed or (named > fixed and asked is None)):
+            more = "" if named < fixed else f", or add --views {fixed} to have the best of them chosen"
+            raise InputError(f"--frames names {named} images: {self._fixed()}; name {fixed}{more}")
+        return fixed
+
+    def _fixed(self) -> str:
+        return f"{self.path} was exported for {self.description.fixed_views} views"
+
     def check_size(self, views: int, height: int, width: int) -> None:
         """Raise InputError unless the model takes this many views of this size."""
         own = self.description
         if own.fixed_views and views != own.fixed_views:
-            raise InputError(
-                f"{self.path}: was exported for {own.fixed_views} views and got {views}; use --views {own.fixed_views}"
-            )
+            raise InputError(f"{self._fixed()} and got {views}; give {own.fixed_views}, or export without --views")
         if own.fixed_size and (height, width) != (own.height, own.width):
             raise InputError(
                 f"{self.path}: was exported for {own.height}x{own.width} and got {height}x{width}; "

@@ -68,7 +68,7 @@ def test_floating_point_images_are_not_darkened(runner, scene):
 def test_images_that_may_mean_anything_are_refused(runner, scene, change):
     cameras = read_cameras(scene / "transforms.json")[:2]
     images = [load_image(scene / camera.name) for camera in cameras]
-    with pytest.raises(InputError, match="001.png: an image of .*expected RGB .* uint8 in 0 to 255 or as floating"):
+    with pytest.raises(InputError, match=r"001\.png: an image of .*expected RGB .* uint8 in 0 to 255 or as floating"):
         runner.predict([images[0], change(images[1])], cameras)
 
 
