@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from .cameras import Camera, read_cameras
     from .errors import InputError
-    from .formats import read_scene, write_scene
+    from .formats import read_offset, read_scene, write_scene
     from .gaussians import Gaussians
     from .ply import read_ply, write_ply
     from .rasterizer import rasterize
@@ -23,6 +23,7 @@ _MODULE_OF = {
     "Runner": "runner",
     "rasterize": "rasterizer",
     "read_cameras": "cameras",
+    "read_offset": "formats",
     "read_ply": "ply",
     "read_scene": "formats",
     "write_ply": "ply",
@@ -37,6 +38,7 @@ __all__ = [
     "Runner",
     "rasterize",
     "read_cameras",
+    "read_offset",
     "read_ply",
     "read_scene",
     "write_ply",

@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from .camera_format import ESTIMATE, CameraFormat
+from .depth_format import DepthFormat
 from .errors import InputError, exit_on_input_error
 from .files import check_writable, make_folder, replacing
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-    import numpy as np
 
     from .cleaning import Cleaning
     from .depth_range import DepthRange
@@ -27,6 +26,8 @@ if TYPE_CHECKING:
 
 # Frames of the path that --render draws from the first view to the last.
 PATH_FRAMES = 24
+# How many pixels COLMAP's fusion asks of a point unless told otherwise.
+COLMAP_MIN_PIXELS = 5
 # What the folder's name ends in where a model that predicts depth alone is not told where to.
 DEPTH_FOLDER = "-depth"
 OUT_HELP = (
@@ -71,8 +72,19 @@ def infer(
     size: Annotated[str | None, typer.Option(help="HEIGHTxWIDTH to work at instead of the trained size.")] = None,
     near: Annotated[float | None, typer.Option(help="Nearest depth in scene units, else found.")] = None,
     far: Annotated[float | None, typer.Option(help="Farthest depth in scene units, else found.")] = None,
+    offset: Annotated[
+        str | None,
+        typer.Option(
+            help="Write coordinates relative to this, where they are large (surveys): `auto` finds it if it is needed.",
+            metavar="auto|X,Y,Z",
+        ),
+    ] = None,
     provider: Annotated[str, typer.Option(help="ONNX Runtime execution provider, such as CPU or CUDA.")] = "CPU",
-    save_depth: Annotated[Path | None, typer.Option(help="Folder for depth maps (.png and metric .npz).")] = None,
+    save_depth: Annotated[Path | None, typer.Option(help="Folder for depth maps with their cameras.")] = None,
+    depth_format: Annotated[
+        DepthFormat | None,
+        typer.Option(help="Of --save-depth: .png and metric .npz (default), or a dense workspace of COLMAP."),
+    ] = None,
     render: Annotated[Path | None, typer.Option(help="Folder for views drawn from the result.")] = None,
     min_opacity: Annotated[float, typer.Option(help="Leave out fainter Gaussians.", rich_help_panel=CLEANING)] = 0,
     trim_border: Annotated[
@@ -121,16 +133,19 @@ def infer(
     started = time.perf_counter()
     _check_outputs(out, (json_path, save_cameras, report), (save_depth, render))
     _check_range(near, far)
+    _check_offset(offset)
     cleaning = Cleaning(min_opacity, trim_border, trim_edges, min_confidence, merge_duplicates)
     given = Request([*images, *(more_images or [])], cameras, camera_format, focal, frames, views, size)
     with working("loading the model"):
         runner = Runner(model or default_model(), provider)
     _check_fit(runner, out, cleaning, {"--render": render, "--report": report})
+    _check_depth_format(depth_format, save_depth, runner)
     preparing = time.perf_counter()
     inputs = read_inputs(given, runner)
     prepared = inputs.views
     with working("finding near and far"):
         span = runner.depth_range(prepared, near, far)
+    prepared, place_notes = _place(prepared, offset, span)
     predicting = time.perf_counter()
     prediction = _predict(prepared, runner, span)
     writing = time.perf_counter()
@@ -140,7 +155,7 @@ def infer(
     _write_scene(prediction, prepared, out, cleaning)
     if prediction.gaussians is None and save_depth is None:  # depth maps are what such a model is for
         save_depth = make_folder(out.with_name(out.name.partition(".")[0] + DEPTH_FOLDER))
-    pictures = _write_pictures(prediction, prepared, save_depth, render)
+    pictures = _write_pictures(prediction, prepared, save_depth, depth_format, render)
     written = [out]
     if save_cameras is not None:
         write_cameras(save_cameras, inputs.cameras)
@@ -148,6 +163,7 @@ def infer(
     seconds = {"load": runner.load_seconds, "prepare": predicting - preparing, **prediction.seconds}
     seconds |= {"write": time.perf_counter() - writing, "total": time.perf_counter() - started}
     summary = _summary(prediction, inputs, cameras, runner, span, seconds, [*written, *pictures])
+    summary |= {"offset": prepared.offset.tolist(), "notes": [*inputs.notes, *place_notes]}
     summary["cleaned"] = {"asked": asdict(cleaning), "left_out": cleaned}
     if report is not None:
         from .inference_report import write_report
@@ -159,12 +175,12 @@ def infer(
         with replacing(json_path) as temporary:
             temporary.write_text(json.dumps(summary, indent=2) + "\n")
         written.append(json_path)
-    for note in inputs.notes:
+    for note in [*inputs.notes, *place_notes]:
         print(note)
     print(f"near {span.near:.4g} and far {span.far:.4g}, in the cameras' unit: {span.source}")
     for path in written:
         print(f"wrote {path}")
-    _say_pictures(len(prepared.names), save_depth, render)
+    _say_pictures(len(prepared.names), save_depth, depth_format, render)
     if prediction.gaussians is not None and holds_splats(out):
         _say_how_to_look(out, given, save_cameras)
     else:
@@ -180,8 +196,17 @@ def main() -> None:
     typer.run(infer)
 
 
-def _say_pictures(views: int, save_depth: Path | None, render: Path | None) -> None:
-    if save_depth is not None:
+def _say_pictures(views: int, save_depth: Path | None, depth_format: DepthFormat | None, render: Path | None) -> None:
+    if save_depth is not None and depth_format is DepthFormat.COLMAP:
+        fuse = ["colmap", "stereo_fusion", "--workspace_path", str(save_depth)]
+        fuse += ["--output_path", str(save_depth / "fused.ply")]
+        if views < COLMAP_MIN_PIXELS:
+            fuse += ["--StereoFusion.min_num_pixels", str(views)]
+        print(
+            f"wrote {save_depth}: {views} depth maps as a dense workspace of COLMAP; to make one cloud of points of it:"
+        )
+        print("    " + shlex.join(fuse))
+    elif save_depth is not None:
         print(f"wrote {save_depth}: {views} depth maps, as .png to look at and as .npz in the cameras' unit")
     if render is not None:
         print(f"wrote {render}: {views} views and {PATH_FRAMES} frames of a path through them, as .png")
@@ -237,6 +262,11 @@ def _check_fit(runner: "Runner", out: Path, cleaning: "Cleaning", drawn: dict[st
         raise InputError(f"--out {out}: of all cleaning a surface knows --trim-edges alone; leave out the rest")
 
 
+def _check_depth_format(depth_format: DepthFormat | None, save_depth: Path | None, runner: "Runner") -> None:
+    if depth_format is not None and save_depth is None and runner.description.gaussians:
+        raise InputError(f"--depth-format {depth_format}: give --save-depth, the folder to write to")
+
+
 def _check_range(near: float | None, far: float | None) -> None:
     """What can be said of --near and --far before the model's own range is known."""
     for name, value in (("--near", near), ("--far", far)):
@@ -244,6 +274,20 @@ def _check_range(near: float | None, far: float | None) -> None:
             raise InputError(f"{name} {value:g}: expected a positive depth in scene units")
     if near is not None and far is not None and near >= far:
         raise InputError(f"--near {near:g} and --far {far:g}: expected near < far")
+
+
+def _check_offset(offset: str | None) -> None:
+    if offset is not None:
+        from .world_offset import parse_offset
+
+        parse_offset(offset)
+
+
+def _place(views: "Views", offset: str | None, span: "DepthRange") -> "tuple[Views, list[str]]":
+    """The views relative to --offset, and lines for the user."""
+    from .world_offset import with_offset
+
+    return with_offset(views, offset, span.near)
 
 
 def _predict(views: "Views", runner: "Runner", span: "DepthRange") -> "Prediction":
@@ -266,13 +310,15 @@ def _clean(prediction: "Prediction", views: "Views", cleaning: "Cleaning") -> "t
 def _write_scene(prediction: "Prediction", views: "Views", out: Path, cleaning: "Cleaning") -> None:
     """Write the splats, points or surface that the file's name asks for."""
     from .depth_mesh import LARGEST_JUMP, faces_from_depth
-    from .formats import is_surface, write_scene
+    from .formats import is_surface, lost_offset, write_scene
     from .point_cloud import points_from_depth, write_mesh, write_point_cloud
 
     if not is_surface(out) and prediction.gaussians is not None:
-        for note in write_scene(out, prediction.gaussians):
+        for note in write_scene(out, prediction.gaussians, views.offset):
             print(f"note: {note}")
         return
+    for note in lost_offset(views.offset):
+        print(f"note: {note}")
     points = points_from_depth(prediction.depth, views.images, views.extrinsics, views.intrinsics)
     if is_surface(out):
         write_mesh(out, points, faces_from_depth(prediction.depth, cleaning.trim_edges or LARGEST_JUMP))
@@ -281,13 +327,17 @@ def _write_scene(prediction: "Prediction", views: "Views", out: Path, cleaning: 
 
 
 def _write_pictures(
-    prediction: "Prediction", views: "Views", save_depth: Path | None, render: Path | None
+    prediction: "Prediction",
+    views: "Views",
+    save_depth: Path | None,
+    depth_format: DepthFormat | None,
+    render: Path | None,
 ) -> list[Path]:
     """Write depth maps and drawn views, where asked for; the paths written."""
     stems = _stems(views.names)
     written = []
     if save_depth is not None:
-        written += _write_depth(prediction.depth, stems, save_depth)
+        written += _write_depth(prediction, views, stems, save_depth, depth_format)
     if render is not None:
         written += _write_renders(prediction, views, stems, render)
     return written
@@ -300,20 +350,15 @@ def _stems(names: list[str]) -> list[str]:
     return [stem if counts[stem] == 1 else f"{index}-{stem}" for index, stem in enumerate(stems)]
 
 
-def _write_depth(depth: "np.ndarray", stems: list[str], folder: Path) -> list[Path]:
-    """A colour-mapped PNG and a metric .npz (key `depth`) for each view of depth [views, height, width]."""
-    import numpy as np
+def _write_depth(
+    prediction: "Prediction", views: "Views", stems: list[str], folder: Path, depth_format: DepthFormat | None
+) -> list[Path]:
+    """Write depth maps in the form that is asked for; the paths written."""
+    from .colmap_workspace import write_workspace
+    from .depth_maps import write_depth_maps
 
-    from .images_out import save_depth_png
-
-    written = []
-    for stem, values in zip(stems, depth, strict=True):
-        picture, metric = folder / f"{stem}.png", folder / f"{stem}.npz"
-        save_depth_png(picture, values)
-        with replacing(metric) as temporary:
-            np.savez_compressed(temporary, depth=values)
-        written += [picture, metric]
-    return written
+    write = write_workspace if depth_format is DepthFormat.COLMAP else write_depth_maps
+    return write(folder, stems, prediction, views)
 
 
 def _write_renders(prediction: "Prediction", views: "Views", stems: list[str], folder: Path) -> list[Path]:

@@ -20,7 +20,7 @@ def convert(
     written as points. What a format cannot hold is named.
     """
     from .files import check_writable
-    from .formats import read_scene, scene_suffix, write_scene
+    from .formats import read_offset, read_scene, scene_suffix, write_scene
 
     scene_suffix(out)
     check_writable(out.parent)
@@ -34,7 +34,7 @@ def convert(
         if not len(gaussians):
             raise InputError(f"--min-opacity {min_opacity:g}: no Gaussian is left of {whole}; use a smaller one")
         print(f"cleaned: {whole - len(gaussians):,} too faint; {len(gaussians):,} Gaussians left")
-    for note in write_scene(out, gaussians):
+    for note in write_scene(out, gaussians, read_offset(scene)):
         print(f"note: {note}")
     print(f"wrote {out}: {len(gaussians):,} Gaussians, {out.stat().st_size / 1e6:.1f} MB")
 

@@ -8,11 +8,11 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from .cameras import Camera, CameraFormat, read_cameras
+from .cameras import Camera, CameraFormat, read_cameras, relative_cameras
 from .drawing import BLACK, draw_view
 from .errors import InputError, exit_on_input_error
 from .files import check_writable, make_folder, replacing
-from .formats import read_scene
+from .formats import read_offset, read_scene
 from .gaussians import Gaussians
 from .images_out import depth_colours, depth_ends, save_png
 from .progress import progress
@@ -68,6 +68,7 @@ def render(
     if path and not views:
         raise InputError("--path: needs the cameras that it leads through; give --cameras, or use --orbit")
     gaussians = read_scene(scene)
+    views = relative_cameras(views, read_offset(scene))
     shots = _shots(gaussians, views, orbit, path, degrees, frames, size)
     kinds = [COLOUR, *[DEPTH] * depth, *[ALPHA] * alpha]
     photographs = {(cameras.parent / _posix(view.name)).resolve(): view.name for view in views} if cameras else {}

@@ -50,6 +50,7 @@ def view(
         _check_page(html)
     gaussians = read_scene(scene)
     viewpoints = read_viewpoints(cameras, camera_format, [*(images or []), *(more_images or [])])
+    viewpoints = _relative(viewpoints, scene)
     if html is None:
         from .viewer import serving
 
@@ -84,6 +85,15 @@ def _check_page(html: Path) -> None:
     if html.suffix.lower() not in (".html", ".htm") or html.is_dir():
         raise InputError(f"--html {html}: expected a file to write, whose name ends in .html")
     check_writable(html.parent)
+
+
+def _relative(viewpoints: "list[Viewpoint]", scene: Path) -> "list[Viewpoint]":
+    """The viewpoints in the world of a scene that was written relative to an offset."""
+    from .cameras import relative_cameras
+    from .formats import read_offset
+
+    cameras = relative_cameras([viewpoint.camera for viewpoint in viewpoints], read_offset(scene))
+    return [viewpoint._replace(camera=camera) for viewpoint, camera in zip(viewpoints, cameras, strict=True)]
 
 
 def read_viewpoints(cameras: Path | None, form: CameraFormat | None, images: list[Path]) -> "list[Viewpoint]":

@@ -2,7 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -34,6 +34,7 @@ class Views:
     intrinsics: float32, row 0 divided by the width and row 1 by the height, [views, 3, 3].
     cameras: the same cameras undistorted, at the full size of the pictures, [views].
     choice: how these views were chosen of more, in words; empty where there was no choice.
+    offset: what was subtracted from the user's world coordinates, float64 [3]; see `world_offset`.
     """
 
     names: list[str]
@@ -42,6 +43,7 @@ class Views:
     intrinsics: np.ndarray
     cameras: list[Camera]
     choice: str = ""
+    offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
 
 def match(images: Sequence[Path], cameras: Sequence[Camera]) -> list[tuple[Path, Camera]]:
