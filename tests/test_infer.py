@@ -7,7 +7,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import onnx
 import pytest
 import trimesh
 from conftest import run_command
@@ -86,47 +85,6 @@ def test_commands_to_copy_work_in_folders_with_spaces(workplace, capsys):
     assert render == ["idesplat-render", "my scene.ply", *cameras, "--out", "DIR"]
     assert run_command(render_main, *render[1:]) == 0
     assert run_command(view_main, *view[1:], "--html", "page.html") == 0
-
-
-@pytest.fixture
-def for_three(workplace):
-    """The model, which says that it was exported for three views, as its inputs do."""
-    model = onnx.load("model.onnx")
-    fix_views(model, 3)
-    onnx.save(model, "model.onnx")
-
-
-def fix_views(model, views):
-    """Have a graph that takes any number of views say that it takes this many."""
-    (entry,) = model.metadata_props
-    entry.value = json.dumps(json.loads(entry.value) | {"fixed_views": views})
-    for value in model.graph.input:
-        value.type.tensor_type.shape.dim[0].dim_value = views
-
-
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    (
-        (("--views", "4"), "--views 4: model.onnx was exported for 3 views; use --views 3"),
-        (("--views", "2"), "--views 2: model.onnx was exported for 3 views; use --views 3"),
-        (
-            ("--frames", "0,1,2,3"),
-            "--frames names 4 images: model.onnx was exported for 3 views; name 3, or add --views 3",
-        ),
-        (("--frames", "0,1"), "--frames names 2 images: model.onnx was exported for 3 views; name 3"),
-        (("--images", "images/000.png", "images/001.png"), "model.onnx was exported for 3 views and got 2; give 3"),
-    ),
-)
-def test_a_fixed_number_of_views_is_kept(for_three, capsys, arguments, expected):
-    assert run_command(main, *USUAL[2:], *(() if "--images" in arguments else USUAL[:2]), *arguments) == 2
-    assert expected in capsys.readouterr().err
-    assert not Path("scene.ply").exists()
-
-
-def test_a_fixed_number_of_views_is_used(for_three, capsys):
-    for arguments in ((), ("--views", "3"), ("--frames", "0,2,4"), ("--frames", "0,1,2,4", "--views", "3")):
-        assert run_command(main, *USUAL, *arguments, "--json", "summary.json") == 0
-        assert len(json.loads(Path("summary.json").read_text())["views"]) == 3
 
 
 def test_what_is_not_used_is_said(workplace, capsys, monkeypatch):
