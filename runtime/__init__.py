@@ -11,7 +11,7 @@ from . import startup as startup
 if TYPE_CHECKING:
     from .cameras import Camera, read_cameras
     from .errors import InputError
-    from .formats import read_scene, write_scene
+    from .formats import read_offset, read_scene, write_scene
     from .gaussians import Gaussians
     from .ply import read_ply, write_ply
     from .rasterizer import rasterize
@@ -25,6 +25,7 @@ _MODULE_OF = {
     "Runner": "runner",
     "rasterize": "rasterizer",
     "read_cameras": "cameras",
+    "read_offset": "formats",
     "read_ply": "ply",
     "read_scene": "formats",
     "write_ply": "ply",
@@ -39,6 +40,7 @@ __all__ = [
     "Runner",
     "rasterize",
     "read_cameras",
+    "read_offset",
     "read_ply",
     "read_scene",
     "write_ply",

@@ -1,16 +1,25 @@
 """What an exported model says of itself: metadata inside every `.onnx`, and the manifest of a staged folder."""
 
 import json
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 from .errors import InputError
+from .files import read_bytes
+from .metadata_fields import Check, checked_fields, distance, flag, names, pair, parse_object, shown, string, whole
 
 # The metadata property that holds the description as JSON, and the only version of its layout so far.
 METADATA_KEY = "idesplat"
 LAYOUT = 1
 MANIFEST_NAME = "manifest.json"
+MANIFEST_FORMAT = "idesplat-staged"
+# Far beyond every network that there is: more would only take time and memory.
+MOST_STAGES = 32
+MOST_BYTES = 1 << 20  # of metadata and manifests
+LARGEST_SIDE = 1 << 16  # pixels
+MOST_VIEWS = 1 << 12
+HIGHEST_SH_DEGREE = 3  # that `Gaussians` and the splat files know
 INPUTS = ("images", "extrinsics", "intrinsics", "near", "far")
 OUTPUTS = ("depth", "means", "scales", "quats", "opacities", "sh")
 CONVENTIONS = (
@@ -64,45 +73,114 @@ class StageFile:
     outputs: list[str]
 
 
+_SIDE, _VIEWS = whole(1, LARGEST_SIDE), whole(1, MOST_VIEWS)
+_DESCRIPTION: dict[str, Check] = {
+    "preset": string,
+    "height": _SIDE,
+    "width": _SIDE,
+    "size_multiple": _SIDE,
+    "fixed_size": flag,
+    "fixed_views": whole(0, MOST_VIEWS),
+    "near": distance,
+    "far": distance,
+    "trained_views": pair(_VIEWS),
+    "trained_sides": pair(_SIDE),
+    "sh_degree": whole(0, HIGHEST_SH_DEGREE),
+    "checkpoint": string,
+    "checkpoint_sha256": string,
+    "version": string,
+    "gaussians": flag,
+    "precision": string,
+    "conventions": string,
+}
+_ADDED_LATER = frozenset({"gaussians", "precision", "conventions"})
+_STAGE: dict[str, Check] = {"name": string, "file": string, "inputs": names, "outputs": names}
+
+
 def read_description(properties: dict[str, str], path: Path) -> Description:
-    """The description in a model's metadata properties; raises InputError if the model is not ours."""
+    """The description in a model's metadata properties; raises InputError if it is none of ours, or damaged."""
     if METADATA_KEY not in properties:
         lack = f"not a model of this project (no '{METADATA_KEY}' metadata)"
         raise InputError(f"{path}: {lack}; make one with idesplat-export")
+    text = properties[METADATA_KEY]
     try:
-        content = json.loads(properties[METADATA_KEY])
-        if content.get("layout") != LAYOUT:
-            found = f"metadata layout {content.get('layout')!r}, expected {LAYOUT}"
-            raise InputError(f"{path}: {found}; export it again with this version")
-        return _from_dict(Description, content)
-    except (ValueError, TypeError, AttributeError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path}: damaged metadata ({error}); export it again") from None
+        if len(text) > MOST_BYTES:
+            raise InputError(f"{len(text)} characters, expected {MOST_BYTES} at most")
+        content = parse_object(text)
+        layout = content.get("layout")
+        if isinstance(layout, bool) or layout != LAYOUT:
+            found = f"metadata layout {shown(layout)}, expected {LAYOUT}"
+            raise InputError(f"{found}; export it again with this version")
+        description = Description(**checked_fields(content, _DESCRIPTION, _ADDED_LATER))
+        _check_description(description)
+    except InputError as error:
+        raise InputError(f"{path}: damaged metadata: {error}; export it again") from None
+    return description
+
+
+def _check_description(own: Description) -> None:
+    """What the fields must be together."""
+    if not own.near < own.far:
+        raise InputError(f"near {own.near:g} and far {own.far:g}, expected near < far")
+    if own.fixed_views == 1:
+        raise InputError("fixed_views is 1, expected 0 for any number, or two or more")
+    if own.height % own.size_multiple or own.width % own.size_multiple:
+        raise InputError(f"size {own.height}x{own.width}, expected multiples of {own.size_multiple}")
 
 
 def write_manifest(folder: Path, stages: list[StageFile]) -> None:
     """Write the list of a staged folder's graphs, in the order in which they run."""
-    content = {"format": "idesplat-staged", "layout": LAYOUT, "stages": [asdict(stage) for stage in stages]}
+    content = {"format": MANIFEST_FORMAT, "layout": LAYOUT, "stages": [asdict(stage) for stage in stages]}
     (folder / MANIFEST_NAME).write_text(json.dumps(content, indent=2) + "\n")
 
 
 def read_manifest(folder: Path) -> list[StageFile]:
-    """The graphs of a staged folder; raises InputError if it has no valid manifest or misses a file."""
+    """The graphs of a staged folder; raises InputError if its manifest is not valid, or a file missing."""
     path = folder / MANIFEST_NAME
+    if not path.exists():
+        raise InputError(f"{folder}: no {MANIFEST_NAME}, expected a folder made by idesplat-export --staged")
+    content = read_bytes(path, "the manifest of a staged folder", MOST_BYTES)
     try:
-        content = json.loads(path.read_text())
-        stages = [_from_dict(StageFile, entry) for entry in content["stages"]]
-    except FileNotFoundError:
-        raise InputError(f"{folder}: no {MANIFEST_NAME}, expected a folder made by idesplat-export --staged") from None
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-        raise InputError(f"{path}: damaged manifest ({error}); export it again") from None
-    for stage in stages:
-        if Path(stage.file).name != stage.file or not (folder / stage.file).is_file():
-            raise InputError(f"{path}: names {stage.file}, which is not in the folder; export it again")
+        stages = _stages(parse_object(content))
+        for stage in stages:
+            if Path(stage.file).name != stage.file or not (folder / stage.file).is_file():
+                raise InputError(f"names {shown(stage.file)}, which is not in the folder")
+        _check_order(stages)
+    except (InputError, ValueError, OSError) as error:  # of names that no file can have, the last two
+        raise InputError(f"{path}: damaged manifest: {error}; export it again") from None
     return stages
 
 
-def _from_dict(kind: type, content: dict[str, Any]) -> Any:
-    names = {field.name for field in fields(kind)}
-    return kind(**{key: value for key, value in content.items() if key in names})
+def _stages(content: dict[str, object]) -> list[StageFile]:
+    """The entries of a manifest, each by itself as it should be."""
+    if content.get("format") != MANIFEST_FORMAT:
+        raise InputError(f'format is {shown(content.get("format"))}, expected "{MANIFEST_FORMAT}"')
+    layout = content.get("layout")
+    if isinstance(layout, bool) or layout != LAYOUT:
+        raise InputError(f"layout is {shown(layout)}, expected {LAYOUT}")
+    entries = content.get("stages")
+    if not isinstance(entries, list) or not 1 <= len(entries) <= MOST_STAGES:
+        raise InputError(f"stages is {shown(entries)}, expected a list of 1 to {MOST_STAGES}")
+    stages = []
+    for index, entry in enumerate(entries):
+        try:
+            stages.append(StageFile(**checked_fields(entry, _STAGE)))
+        except InputError as error:
+            raise InputError(f"stages[{index}]: {error}") from None
+    return stages
+
+
+def _check_order(stages: Sequence[StageFile]) -> None:
+    """Every stage has a name and a file of its own, reads what there is by then, and yields what there was not."""
+    for values, what in (([stage.name for stage in stages], "name"), ([stage.file for stage in stages], "file")):
+        if len(set(values)) < len(values):
+            raise InputError(f"two stages have the same {what}")
+    known = set(INPUTS)
+    for stage in stages:
+        unknown = [name for name in stage.inputs if name not in known]
+        if unknown:
+            raise InputError(f"stage {shown(stage.name)} reads {shown(unknown[0])}, which no stage before it yields")
+        twice = [name for name in stage.outputs if name in known]
+        if twice:
+            raise InputError(f"stage {shown(stage.name)} yields {shown(twice[0])}, which is there already")
+        known |= set(stage.outputs)

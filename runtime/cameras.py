@@ -161,6 +161,18 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
     return replace(camera, width=width, height=height, K=scale @ camera.K)
 
 
+def relative_cameras(cameras: Sequence[Camera], offset: np.ndarray) -> list[Camera]:
+    """Cameras in a world whose origin is at `offset` [3] of theirs, as that of a scene with an offset is."""
+    if not offset.any():
+        return list(cameras)
+    moved = []
+    for camera in cameras:
+        extrinsics = camera.extrinsics.copy()
+        extrinsics[:3, 3] -= offset
+        moved.append(replace(camera, extrinsics=extrinsics))
+    return moved
+
+
 def rigid(pose: np.ndarray) -> np.ndarray:
     """Return the pose [4, 4] as float64 with an orthonormal rotation.
 

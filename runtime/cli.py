@@ -12,15 +12,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from .camera_format import ESTIMATE, CameraFormat
+from .depth_format import DepthFormat
 from .errors import InputError, exit_on_input_error
-from .files import replacing
 from .outputs import STANDARD_OUTPUT, Overwrite, guards_outputs, name_files, outputs, write_json
 from .terminal import run, say
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-    import numpy as np
 
     from .cameras import Camera
     from .cleaning import Cleaning
@@ -31,7 +29,8 @@ if TYPE_CHECKING:
 
 # Frames of the path that --render draws from the first view to the last.
 PATH_FRAMES = 24
-DEPTH_ENDINGS = (".png", ".npz")  # of a depth map to look at, and of a metric one
+# How many pixels COLMAP's fusion asks of a point unless told otherwise.
+COLMAP_MIN_PIXELS = 5
 # What the folder's name ends in where a model that predicts depth alone is not told where to.
 DEPTH_FOLDER = "-depth"
 # Beside the scene, the cameras that were estimated for it.
@@ -79,8 +78,19 @@ def infer(
     size: Annotated[str | None, typer.Option(help="HEIGHTxWIDTH to work at instead of the trained size.")] = None,
     near: Annotated[float | None, typer.Option(help="Nearest depth in scene units, else found.")] = None,
     far: Annotated[float | None, typer.Option(help="Farthest depth in scene units, else found.")] = None,
+    offset: Annotated[
+        str | None,
+        typer.Option(
+            help="Write coordinates relative to this, where they are large (surveys): `auto` finds it if it is needed.",
+            metavar="auto|X,Y,Z",
+        ),
+    ] = None,
     provider: Annotated[str, typer.Option(help="ONNX Runtime execution provider, such as CPU or CUDA.")] = "CPU",
-    save_depth: Annotated[Path | None, typer.Option(help="Folder for depth maps (.png and metric .npz).")] = None,
+    save_depth: Annotated[Path | None, typer.Option(help="Folder for depth maps with their cameras.")] = None,
+    depth_format: Annotated[
+        DepthFormat | None,
+        typer.Option(help="Of --save-depth: .png and metric .npz (default), or a dense workspace of COLMAP."),
+    ] = None,
     render: Annotated[Path | None, typer.Option(help="Folder for views drawn from the result.")] = None,
     min_opacity: Annotated[float, typer.Option(help="Leave out fainter Gaussians.", rich_help_panel=CLEANING)] = 0,
     trim_border: Annotated[
@@ -141,18 +151,21 @@ def infer(
     files = {"--out": out, "--json": json_path, "--save-cameras": save_cameras, "--report": report}
     _announce(given, model, files, {"--save-depth": save_depth, "--render": render})
     _check_range(near, far)
+    _check_offset(offset)
     cleaning = Cleaning(min_opacity, trim_border, trim_edges, min_confidence, merge_duplicates)
     with working("loading the model"):
         runner = Runner(model, provider)
     _check_fit(runner, out, cleaning, {"--render": render, "--report": report})
+    _check_depth_format(depth_format, save_depth, runner)
     preparing = time.perf_counter()
     inputs = read_inputs(given, runner)
     prepared = inputs.views
     if not runner.description.gaussians and save_depth is None:  # depth maps are what such a model is for
         save_depth = _beside(out, DEPTH_FOLDER)
-    _announce_pictures(given, inputs, save_depth, render)
+    _announce_pictures(given, inputs, save_depth, depth_format, render)
     with working("finding near and far"):
         span = runner.depth_range(prepared, near, far)
+    prepared, place_notes = _place(prepared, offset, span)
     predicting = time.perf_counter()
     prediction = _predict(prepared, runner, span)
     writing = time.perf_counter()
@@ -160,7 +173,7 @@ def infer(
     if cleaning.asked and not is_surface(out):
         prediction, cleaned = _clean(prediction, prepared, cleaning)
     _write_scene(prediction, prepared, out, cleaning)
-    pictures = _write_pictures(prediction, prepared, save_depth, render)
+    pictures = _write_pictures(prediction, prepared, save_depth, depth_format, render)
     written = [out]
     if save_cameras is not None:
         found = inputs.cameras
@@ -169,6 +182,7 @@ def infer(
     seconds = {"load": runner.load_seconds, "prepare": predicting - preparing, **prediction.seconds}
     seconds |= {"write": time.perf_counter() - writing, "total": time.perf_counter() - started}
     summary = _summary(prediction, inputs, cameras, runner, span, seconds, [*written, *pictures])
+    summary |= {"offset": prepared.offset.tolist(), "notes": [*inputs.notes, *place_notes]}
     summary["cleaned"] = {"asked": asdict(cleaning), "left_out": cleaned}
     if report is not None:
         from .inference_report import write_report
@@ -180,12 +194,12 @@ def infer(
         write_json(json_path, json.dumps(summary, indent=2))
         if json_path != STANDARD_OUTPUT:
             written.append(json_path)
-    for note in inputs.notes:
+    for note in [*inputs.notes, *place_notes]:
         say(note)
     say(f"near {span.near:.4g} and far {span.far:.4g}, in the cameras' unit: {span.source}")
     for path in written:
         say(f"wrote {path}{_described(path, prediction, seconds) if path == out else ''}")
-    _say_pictures(len(prepared.names), save_depth, render)
+    _say_pictures(len(prepared.names), save_depth, depth_format, render)
     if prediction.gaussians is not None and holds_splats(out):
         _say_how_to_look(out, given, save_cameras)
     else:
@@ -201,8 +215,17 @@ def main() -> None:
     run(infer)
 
 
-def _say_pictures(views: int, save_depth: Path | None, render: Path | None) -> None:
-    if save_depth is not None:
+def _say_pictures(views: int, save_depth: Path | None, depth_format: DepthFormat | None, render: Path | None) -> None:
+    if save_depth is not None and depth_format is DepthFormat.COLMAP:
+        fuse = ["colmap", "stereo_fusion", "--workspace_path", str(save_depth)]
+        fuse += ["--output_path", str(save_depth / "fused.ply")]
+        if views < COLMAP_MIN_PIXELS:
+            fuse += ["--StereoFusion.min_num_pixels", str(views)]
+        say(
+            f"wrote {save_depth}: {views} depth maps as a dense workspace of COLMAP; to make one cloud of points of it:"
+        )
+        say("    " + shlex.join(fuse))
+    elif save_depth is not None:
         say(f"wrote {save_depth}: {views} depth maps, as .png to look at and as .npz in the cameras' unit")
     if render is not None:
         say(f"wrote {render}: {views} views and {PATH_FRAMES} frames of a path through them, as .png")
@@ -253,15 +276,20 @@ def _announce(
             run.writes_into(option, folder)
 
 
-def _announce_pictures(given: "Request", inputs: "Inputs", save_depth: Path | None, render: Path | None) -> None:
+def _announce_pictures(
+    given: "Request", inputs: "Inputs", save_depth: Path | None, depth_format: DepthFormat | None, render: Path | None
+) -> None:
     """Say what is written into folders, now that the views are chosen; raises InputError as `_announce`."""
+    from .colmap_workspace import workspace_files
+    from .depth_maps import depth_map_files
     from .input_files import named_images
 
     run, stems = outputs(), _stems(inputs.views)
     if given.cameras != ESTIMATE:
         run.reads("a photograph", named_images(Path(given.cameras), inputs.cameras))
     if save_depth is not None:
-        run.writes("--save-depth", [save_depth / (stem + ending) for stem in stems for ending in DEPTH_ENDINGS])
+        files = workspace_files if depth_format is DepthFormat.COLMAP else depth_map_files
+        run.writes("--save-depth", files(save_depth, stems))
     if render is not None:
         run.writes("--render", [render / name for name in (*map(_view_name, stems), *_path_names())])
 
@@ -321,6 +349,11 @@ def _check_fit(runner: "Runner", out: Path, cleaning: "Cleaning", drawn: dict[st
         raise InputError(f"--out {out}: of all cleaning a surface knows --trim-edges alone; leave out the rest")
 
 
+def _check_depth_format(depth_format: DepthFormat | None, save_depth: Path | None, runner: "Runner") -> None:
+    if depth_format is not None and save_depth is None and runner.description.gaussians:
+        raise InputError(f"--depth-format {depth_format}: give --save-depth, the folder to write to")
+
+
 def _check_range(near: float | None, far: float | None) -> None:
     """What can be said of --near and --far before the model's own range is known."""
     for name, value in (("--near", near), ("--far", far)):
@@ -330,11 +363,25 @@ def _check_range(near: float | None, far: float | None) -> None:
         raise InputError(f"--near {near:g} and --far {far:g}: expected near < far")
 
 
+def _check_offset(offset: str | None) -> None:
+    if offset is not None:
+        from .world_offset import parse_offset
+
+        parse_offset(offset)
+
+
+def _place(views: "Views", offset: str | None, span: "DepthRange") -> "tuple[Views, list[str]]":
+    """The views relative to --offset, and lines for the user."""
+    from .world_offset import with_offset
+
+    return with_offset(views, offset, span.near)
+
+
 def _predict(views: "Views", runner: "Runner", span: "DepthRange") -> "Prediction":
     from .progress import working
 
     with working("predicting depth and Gaussians"):
-        return runner.predict_arrays(views.images, views.extrinsics, views.intrinsics, span.near, span.far)
+        return runner.predict_views(views, span.near, span.far)
 
 
 def _clean(prediction: "Prediction", views: "Views", cleaning: "Cleaning") -> "tuple[Prediction, dict[str, int]]":
@@ -350,13 +397,15 @@ def _clean(prediction: "Prediction", views: "Views", cleaning: "Cleaning") -> "t
 def _write_scene(prediction: "Prediction", views: "Views", out: Path, cleaning: "Cleaning") -> None:
     """Write the splats, points or surface that the file's name asks for."""
     from .depth_mesh import LARGEST_JUMP, faces_from_depth
-    from .formats import is_surface, write_scene
+    from .formats import is_surface, lost_offset, write_scene
     from .point_cloud import points_from_depth, write_mesh, write_point_cloud
 
     if not is_surface(out) and prediction.gaussians is not None:
-        for note in write_scene(out, prediction.gaussians):
+        for note in write_scene(out, prediction.gaussians, views.offset):
             say(f"note: {note}")
         return
+    for note in lost_offset(views.offset):
+        say(f"note: {note}")
     points = points_from_depth(prediction.depth, views.images, views.extrinsics, views.intrinsics)
     if is_surface(out):
         write_mesh(out, points, faces_from_depth(prediction.depth, cleaning.trim_edges or LARGEST_JUMP))
@@ -365,32 +414,31 @@ def _write_scene(prediction: "Prediction", views: "Views", out: Path, cleaning: 
 
 
 def _write_pictures(
-    prediction: "Prediction", views: "Views", save_depth: Path | None, render: Path | None
+    prediction: "Prediction",
+    views: "Views",
+    save_depth: Path | None,
+    depth_format: DepthFormat | None,
+    render: Path | None,
 ) -> list[Path]:
     """Write depth maps and drawn views, where asked for; the paths written."""
     stems = _stems(views)
     written = []
     if save_depth is not None:
-        written += _write_depth(prediction.depth, stems, save_depth)
+        written += _write_depth(prediction, views, stems, save_depth, depth_format)
     if render is not None:
         written += _write_renders(prediction, views, stems, render)
     return written
 
 
-def _write_depth(depth: "np.ndarray", stems: list[str], folder: Path) -> list[Path]:
-    """A colour-mapped PNG and a metric .npz (key `depth`) for each view of depth [views, height, width]."""
-    import numpy as np
+def _write_depth(
+    prediction: "Prediction", views: "Views", stems: list[str], folder: Path, depth_format: DepthFormat | None
+) -> list[Path]:
+    """Write depth maps in the form that is asked for; the paths written."""
+    from .colmap_workspace import write_workspace
+    from .depth_maps import write_depth_maps
 
-    from .images_out import save_depth_png
-
-    written = []
-    for stem, values in zip(stems, depth, strict=True):
-        picture, metric = (folder / (stem + ending) for ending in DEPTH_ENDINGS)
-        save_depth_png(picture, values)
-        with replacing(metric) as temporary:
-            np.savez_compressed(temporary, depth=values)
-        written += [picture, metric]
-    return written
+    write = write_workspace if depth_format is DepthFormat.COLMAP else write_depth_maps
+    return write(folder, stems, prediction, views)
 
 
 def _write_renders(prediction: "Prediction", views: "Views", stems: list[str], folder: Path) -> list[Path]:

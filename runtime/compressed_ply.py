@@ -20,7 +20,7 @@ from .errors import refuse
 from .files import read_bytes, replacing
 from .gaussians import SH_0, Gaussians, check_finite, check_ranges
 from .morton import morton_order
-from .ply_header import LIST, Element, read_header
+from .ply_header import LIST, Element, offset_comment, read_header
 from .quantization import moved
 from .quaternions import from_smallest_three, smallest_three, unit_quaternions
 
@@ -38,9 +38,10 @@ EXPECTED = "a splat file (.compressed.ply)"
 REMEDY = "expected PlayCanvas' compressed .ply; write it again"
 
 
-def write_compressed_ply(path: Path, gaussians: Gaussians) -> list[str]:
+def write_compressed_ply(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None) -> list[str]:
     """Write Gaussians as a .compressed.ply; the file appears whole or not at all.
 
+    offset: what was subtracted from the world coordinates, [3], which a comment records.
     Returns a line for each thing that the format cannot hold. Raises InputError if a value is not finite or not in our
     units, or the file cannot be written.
     """
@@ -60,7 +61,8 @@ def write_compressed_ply(path: Path, gaussians: Gaussians) -> list[str]:
     chunks = np.stack([mean_ranges, scale_ranges, colour_ranges], axis=1).astype("<f4")  # [chunks, 3, 2, 3]
     rest = gaussians.sh[order, 1:].transpose(0, 2, 1)  # [gaussians, 3, coefficients]
     with replacing(path) as temporary, temporary.open("wb") as file:
-        file.write(_header(len(chunks), len(gaussians), rest[0].size if len(rest) else 0).encode("ascii"))
+        comment = "" if offset is None else offset_comment(offset)
+        file.write(_header(len(chunks), len(gaussians), rest[0].size if len(rest) else 0, comment).encode("ascii"))
         file.write(chunks.tobytes())
         file.write(np.stack(words, axis=1).astype("<u4").tobytes())
         file.write(np.clip((rest / (2 * SH_LIMIT) + 0.5) * 256, 0, 255).astype(np.uint8).tobytes())
@@ -96,8 +98,8 @@ def _ranges(chunks: np.ndarray) -> list[np.ndarray]:
     return [np.stack([columns[name] for name in CHUNK_PROPERTIES[at : at + 6]], axis=1) for at in (0, 6, 12)]
 
 
-def _header(chunks: int, vertices: int, sh_values: int) -> str:
-    lines = ["ply", "format binary_little_endian 1.0", f"element chunk {chunks}"]
+def _header(chunks: int, vertices: int, sh_values: int, comment: str) -> str:
+    lines = ["ply", "format binary_little_endian 1.0", *comment.splitlines(), f"element chunk {chunks}"]
     lines += [f"property float {name}" for name in CHUNK_PROPERTIES]
     lines += [f"element vertex {vertices}", *(f"property uint {name}" for name in VERTEX_PROPERTIES)]
     if sh_values:

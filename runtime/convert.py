@@ -23,7 +23,7 @@ def convert(
     .ply, .compressed.ply, .splat, .spz, .sog and .glb are read and written; .points.ply, .points.glb, .obj and .xyz are
     written as points. What a format cannot hold is named.
     """
-    from .formats import read_scene, scene_suffix, write_scene
+    from .formats import read_offset, read_scene, scene_suffix, write_scene
 
     scene_suffix(out)
     outputs().reads("the scene", [scene])
@@ -36,7 +36,7 @@ def convert(
         if not len(gaussians):
             raise InputError(f"--min-opacity {min_opacity:g}: no Gaussian is left of {whole}; use a smaller one")
         say(f"cleaned: {whole - len(gaussians):,} too faint; {len(gaussians):,} Gaussians left")
-    for note in write_scene(out, gaussians):
+    for note in write_scene(out, gaussians, read_offset(scene)):
         say(f"note: {note}")
     say(f"wrote {out}: {len(gaussians):,} Gaussians, {out.stat().st_size / 1e6:.1f} MB")
 

@@ -7,14 +7,16 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from .compressed_ply import read_compressed_ply, write_compressed_ply
 from .errors import InputError
 from .gaussians import Gaussians, check_finite
-from .glb import read_glb, write_glb
+from .glb import glb_offset, read_glb, write_glb
 from .ply import read_ply, write_ply
-from .ply_header import has_element
+from .ply_header import has_element, header_offset
 from .point_cloud import points_from_gaussians, write_point_cloud
-from .sog import read_sog, write_sog
+from .sog import read_sog, sog_offset, write_sog
 from .splat import read_splat, write_splat
 from .spz import read_spz, write_spz
 
@@ -22,16 +24,33 @@ from .spz import read_spz, write_spz
 class SceneFormat(NamedTuple):
     """How Gaussians become one kind of file and come back.
 
-    write: returns a line for each thing that the file does not hold.
+    write: is given what was subtracted from the world coordinates, [3]; returns a line for each thing that the file
+    does not hold. offset: reads that back; None where the format has no room for it.
     """
 
-    write: Callable[[Path, Gaussians], list[str]]
+    write: Callable[[Path, Gaussians, np.ndarray], list[str]]
     read: Callable[[Path], Gaussians]
+    offset: Callable[[Path], np.ndarray] | None = None
 
 
-def _write_ply(path: Path, gaussians: Gaussians) -> list[str]:
-    write_ply(path, gaussians)
+def _write_ply(path: Path, gaussians: Gaussians, offset: np.ndarray) -> list[str]:
+    write_ply(path, gaussians, offset)
     return []
+
+
+def _write_splat(path: Path, gaussians: Gaussians, offset: np.ndarray) -> list[str]:
+    return write_splat(path, gaussians) + lost_offset(offset)
+
+
+def _write_spz(path: Path, gaussians: Gaussians, offset: np.ndarray) -> list[str]:
+    return write_spz(path, gaussians) + lost_offset(offset)
+
+
+def lost_offset(offset: np.ndarray) -> list[str]:
+    """A line about an offset that a format has no room for."""
+    if not offset.any():
+        return []
+    return [f"the file does not hold that its coordinates are relative to {', '.join(map(repr, offset.tolist()))}"]
 
 
 def _read_ply(path: Path) -> Gaussians:
@@ -40,12 +59,12 @@ def _read_ply(path: Path) -> Gaussians:
 
 
 FORMATS = {
-    ".ply": SceneFormat(_write_ply, _read_ply),
-    ".compressed.ply": SceneFormat(write_compressed_ply, _read_ply),
-    ".splat": SceneFormat(write_splat, read_splat),
-    ".spz": SceneFormat(write_spz, read_spz),
-    ".sog": SceneFormat(write_sog, read_sog),
-    ".glb": SceneFormat(write_glb, read_glb),
+    ".ply": SceneFormat(_write_ply, _read_ply, header_offset),
+    ".compressed.ply": SceneFormat(write_compressed_ply, _read_ply, header_offset),
+    ".splat": SceneFormat(_write_splat, read_splat),
+    ".spz": SceneFormat(_write_spz, read_spz),
+    ".sog": SceneFormat(write_sog, read_sog, sog_offset),
+    ".glb": SceneFormat(write_glb, read_glb, glb_offset),
 }
 
 
@@ -54,22 +73,32 @@ POINTS = (".points.ply", ".points.glb", ".obj", ".xyz")
 MESHES = (".mesh.ply", ".mesh.glb", ".mesh.obj")
 
 
-def write_scene(path: Path, gaussians: Gaussians) -> list[str]:
+def write_scene(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None) -> list[str]:
     """Write Gaussians in the format that the file's name asks for; the file appears whole or not at all.
 
     As points, they are their centres in the colour that they have from all sides.
+    offset: what was subtracted from the world coordinates, [3], which the file is to record; None for nothing.
 
     Returns a line for each thing that the format cannot hold, such as spherical harmonics.
     Raises InputError for an unknown name, values that no file can hold, or a place that cannot be written.
     """
-    suffix = scene_suffix(path)
+    suffix, offset = scene_suffix(path), np.zeros(3) if offset is None else offset
     if suffix in MESHES:
         raise InputError(f"{path}: a surface is made of depth maps, not of Gaussians; write it with idesplat-infer")
     if suffix in POINTS:
         check_finite(path, gaussians)
         write_point_cloud(Path(path), points_from_gaussians(gaussians))
-        return ["points alone, without size, opacity or anything that changes with the direction"]
-    return FORMATS[suffix].write(Path(path), gaussians)
+        return ["points alone, without size, opacity or anything that changes with the direction", *lost_offset(offset)]
+    return FORMATS[suffix].write(Path(path), gaussians, offset)
+
+
+def read_offset(path: Path) -> np.ndarray:
+    """What was subtracted from the world coordinates of a splat file's Gaussians, float64 [3].
+
+    Zeros where the file says nothing. Raises InputError if it cannot be read.
+    """
+    read = FORMATS[scene_suffix(path)].offset
+    return np.zeros(3) if read is None else read(Path(path))
 
 
 def read_scene(path: Path) -> Gaussians:

@@ -17,6 +17,7 @@ from .files import read_bytes, replacing
 from .frames import GLTF, half_turned
 from .gaussians import Gaussians, check_finite, check_ranges
 from .images_out import linear_colours, to_bytes
+from .ply_header import OFFSET, checked_offset
 from .quaternions import unit_quaternions
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -42,9 +43,11 @@ STANDING_STILL = {
 ARRAY_BUFFER = 34962
 
 
-def write_glb(path: Path, gaussians: Gaussians) -> list[str]:
+def write_glb(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None) -> list[str]:
     """Write Gaussians as a .glb; the file appears whole or not at all.
 
+    offset: what was subtracted from the world coordinates, [3], in the scene's own axes, which the extras of the node
+    record: as its translation it would be rounded to float32.
     Returns no line, since nothing is lost. Raises InputError if a value is not finite or not in our units, or the file
     cannot be written.
     """
@@ -62,7 +65,10 @@ def write_glb(path: Path, gaussians: Gaussians) -> list[str]:
     }
     names = _coefficients(turned.sh_degree)
     attributes |= {name: turned.sh[:, index] for index, name in enumerate(names)}
-    document = json.dumps(_document(attributes), separators=(",", ":")).encode()
+    content = _document(attributes)
+    if offset is not None and offset.any():
+        content["nodes"][0]["extras"] = {OFFSET: offset.tolist()}
+    document = json.dumps(content, separators=(",", ":")).encode()
     document += b" " * (-len(document) % 4)
     size = sum(values.nbytes for values in attributes.values())
     with replacing(path) as temporary, temporary.open("wb") as file:
@@ -86,6 +92,18 @@ def read_glb(path: Path) -> Gaussians:
     if (gaussians.scales < 0).any() or ((gaussians.opacities < 0) | (gaussians.opacities > 1)).any():
         refuse(path, "negative scales, or opacities outside 0 to 1", "write it again")
     return half_turned(gaussians, GLTF)
+
+
+def glb_offset(path: Path) -> np.ndarray:
+    """What a .glb says was subtracted from its coordinates, in the scene's own axes, float64 [3]; else zeros.
+
+    Raises InputError as `read_glb`.
+    """
+    document, _ = _chunks(path, read_bytes(path, EXPECTED))
+    nodes = document.get("nodes")
+    extras = [node.get("extras") for node in nodes if isinstance(node, dict)] if isinstance(nodes, list) else []
+    found = [extra[OFFSET] for extra in extras if isinstance(extra, dict) and OFFSET in extra]
+    return checked_offset(path, found[0]) if found else np.zeros(3)
 
 
 def _read_gaussians(path: Path, document: dict[str, Any], binary: bytes) -> Gaussians:

@@ -62,6 +62,7 @@ def read_inputs(request: Request, runner: Runner) -> Inputs:
             from .estimate import estimate_cameras
 
             images = pick_frames(images, request.frames)
+            wanted = _wanted(request, runner, images)
             cameras = estimate_cameras(images, request.focal)
             notes.append(_estimated(len(images), cameras))
             images = [Path(camera.name) for camera in cameras]
@@ -69,12 +70,13 @@ def read_inputs(request: Request, runner: Runner) -> Inputs:
             with working("reading cameras"):
                 cameras = read_cameras(given, images, request.camera_format)
             images = pick_frames(images, request.frames)
+            wanted = _wanted(request, runner, images)
         pairs = match(images, cameras)
         if request.frames is None and len(cameras) > len(pairs):
             notes.append(f"{len(cameras) - len(pairs)} of {len(cameras)} cameras have no photograph among those given")
         own = [camera if path.parent != folder else replace(camera, name=path.name) for path, camera in pairs]
         height, width = parse_size(request.size) if request.size else runner.size_for(own)
-        count = min(_wanted(request, runner) or len(pairs), len(pairs))
+        count = min(wanted or len(pairs), len(pairs))
         runner.check_size(max(count, FEWEST_VIEWS), height, width)
         with working("choosing and reading photographs"):
             views = prepare(pairs, count, height, width)
@@ -126,12 +128,9 @@ def _numbers(word: str, count: int) -> Sequence[int]:
     return numbers if numbers and numbers[-1] < count else []
 
 
-def _wanted(request: Request, runner: Runner) -> int | None:
-    """How many views to use; None for all."""
-    fixed = runner.description.fixed_views
-    if fixed:
-        return fixed
-    return request.views or (None if request.frames else DEFAULT_VIEWS)
+def _wanted(request: Request, runner: Runner, picked: Sequence[Path]) -> int | None:
+    """How many views to use of the images that --frames names; None for all."""
+    return runner.view_count(request.views, len(picked) if request.frames else None, DEFAULT_VIEWS)
 
 
 def _cut(camera: Camera, height: int, width: int, runner: Runner) -> list[str]:

@@ -16,16 +16,17 @@ import numpy as np
 from .errors import InputError, refuse
 from .files import open_regular, replacing
 from .gaussians import Gaussians, check_ranges
-from .ply_header import LIST, Element, read_header
+from .ply_header import LIST, Element, offset_comment, read_header
 
 VERTICES_AT_ONCE = 1 << 13  # their rows stay in the cache while columns are filled one by one
 MIN_OPACITY = 1e-6  # a logit must be finite: opacities are kept this far from 0 and 1
 MIN_SCALE = 1e-30  # so must a logarithm
 
 
-def write_ply(path: Path, gaussians: Gaussians) -> None:
+def write_ply(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None) -> None:
     """Write Gaussians, every SH band, as a binary .ply; the file appears whole or not at all.
 
+    offset: what was subtracted from the world coordinates, [3], which a comment records.
     Opacities are kept 1e-6 away from 0 and 1, so that their logit is finite. Raises InputError if a value is not
     finite, a scale is negative, an opacity outside [0, 1], or the file cannot be written.
     """
@@ -33,7 +34,9 @@ def write_ply(path: Path, gaussians: Gaussians) -> None:
     names = list(_columns(gaussians))
     names[3:3] = ["nx", "ny", "nz"]  # gaussforge and some older viewers insist on normals
     properties = "".join(f"property float {name}\n" for name in names)
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(gaussians)}\n{properties}end_header\n"
+    comment = "" if offset is None else offset_comment(offset)
+    element = f"element vertex {len(gaussians)}\n"
+    header = f"ply\nformat binary_little_endian 1.0\n{comment}{element}{properties}end_header\n"
     with replacing(path) as temporary, temporary.open("wb") as file:
         table = np.zeros((VERTICES_AT_ONCE, len(names)), "<f4")
         _reserve(file, len(header) + len(gaussians) * table.itemsize * len(names))

@@ -28,6 +28,7 @@ NUMBER_TYPES = {
     "double": "<f8",
     "float64": "<f8",
 }
+OFFSET = "offset"  # a comment of three numbers: what was subtracted from the world coordinates
 LIST = "list"  # the type of a property whose length differs from row to row
 
 
@@ -90,3 +91,37 @@ def has_element(path: Path, name: str) -> bool:
             return any(element.name == name for element in read_header(file, path)[0])
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}; expected a splat file (.ply)") from None
+
+
+def offset_comment(offset: np.ndarray) -> str:
+    """The line of a header that records an offset [3]; none for zeros."""
+    return f"comment {OFFSET} {' '.join(map(repr, offset.tolist()))}\n" if offset.any() else ""
+
+
+def header_offset(path: Path) -> np.ndarray:
+    """What a file's header says was subtracted from its coordinates, float64 [3]; zeros where it says nothing.
+
+    Raises InputError if the file cannot be read, or what it says is no offset.
+    """
+    try:
+        with Path(path).open("rb") as file:
+            while file.tell() < MAX_HEADER_BYTES:
+                words = file.readline(MAX_HEADER_BYTES).decode("ascii", errors="replace").split()
+                if words[:2] == ["comment", OFFSET] and len(words) == 5:
+                    return checked_offset(path, words[2:])
+                if not words or words == ["end_header"]:
+                    break
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}; expected a splat file (.ply)") from None
+    return np.zeros(3)
+
+
+def checked_offset(path: Path, values: object) -> np.ndarray:
+    """An offset as a file has it, as float64 [3]; raises InputError if it is none."""
+    try:
+        offset = np.array(values, np.float64)
+    except (TypeError, ValueError):
+        offset = np.zeros(0)
+    if offset.shape != (3,) or not np.isfinite(offset).all():
+        refuse(path, f"records the offset {str(values)[:60]}", "expected three finite numbers; write it again")
+    return offset

@@ -8,11 +8,11 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from .cameras import Camera, CameraFormat, read_cameras
+from .cameras import Camera, CameraFormat, read_cameras, relative_cameras
 from .drawing import draw_view
 from .errors import InputError, exit_on_input_error
 from .files import replacing
-from .formats import read_scene
+from .formats import read_offset, read_scene
 from .gaussians import Gaussians
 from .images_out import depth_colours, depth_ends, save_png
 from .input_files import camera_files, named_images, nearby_images
@@ -79,6 +79,7 @@ def render(
     stems = _stems(names, out, kinds)
     _announce(scene, cameras, views, stems, out, kinds)
     gaussians = read_scene(scene)
+    views = relative_cameras(views, read_offset(scene))
     shots = _shots(gaussians, views, orbit, path, degrees, frames, size)
     check_shots(shots)
     draw = _drawer(gaussians, colour)

@@ -1,6 +1,10 @@
-"""ONNX Runtime sessions: providers checked, threads and memory set from measurement."""
+"""ONNX Runtime sessions: providers checked, threads and memory set from measurement, runs with a time limit."""
 
 import os
+import re
+import threading
+import warnings
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,9 +18,21 @@ from .files import check_regular
 from .graph_cache import place_for
 
 CPU = "CPUExecutionProvider"
-ERRORS_ONLY = 3
+# Errors reach the caller as exceptions; ONNX Runtime's own log would print them to the terminal a second time.
+FATAL_ONLY = 4
 AS_MANY_AS_CORES = 0  # threads
 SUFFIX = "ExecutionProvider"
+# The longest that a graph may run, so that one that never ends is ended: several times what the slowest of the networks
+# takes on one core of a slow machine.
+LONGEST_RUN_S = 900.0
+LONGEST_RUN_S_PER_PIXEL = 2e-3  # of all views together
+LIMIT_VARIABLE = "IDESPLAT_RUN_LIMIT"  # in the environment: seconds, instead of both
+LONGEST_REASON = 300  # characters of ONNX Runtime's messages that are quoted
+# What its messages begin with: a source file, a line and a function.
+SOURCE = re.compile(r"^\S+\.(?:cc|h):\d+ .*?\) ")
+OUT_OF_MEMORY = ("Failed to allocate memory", "bad_alloc", "bad allocation", "out of memory")
+
+onnxruntime.set_default_logger_severity(FATAL_ONLY)
 
 
 def provider_name(provider: str) -> str:
@@ -69,10 +85,9 @@ def open_session(model: Path | bytes, provider: str = CPU, tuning: Tuning = USUA
     try:
         session = _create(model, options, provider)
     except Exception as error:  # ONNX Runtime raises many kinds, all derived from Exception alone
-        reason = str(error).split(" : ")[-1].splitlines()[0]
         where = "the model" if isinstance(model, bytes) else model
         raise InputError(
-            f"{where}: ONNX Runtime cannot load it ({reason}); is it an .onnx file of this project?"
+            f"{where}: ONNX Runtime cannot load it ({_reason(error)}); is it an .onnx file of this project?"
         ) from None
     if session.get_providers()[0] != provider:
         raise InputError(
@@ -91,7 +106,7 @@ def usable_cores() -> int:
 
 def _options(tuning: Tuning) -> onnxruntime.SessionOptions:
     options = onnxruntime.SessionOptions()
-    options.log_severity_level = ERRORS_ONLY
+    options.log_severity_level = FATAL_ONLY
     # Its planning is quadratic in the number of nodes: without it a session opens ten times faster, and a run takes
     # neither longer nor more memory, because the arena reuses buffers all the same.
     options.enable_mem_reuse = False
@@ -114,7 +129,9 @@ def _create(
 ) -> onnxruntime.InferenceSession:
     source = model if isinstance(model, bytes) else str(model)
     providers = None if provider == openvino.PROVIDER else [provider]  # a plug-in is named in the options
-    return onnxruntime.InferenceSession(source, options, providers=providers)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of a provider that is not there, which `open_session` raises for
+        return onnxruntime.InferenceSession(source, options, providers=providers)
 
 
 def _open_cached(model: Path, options: onnxruntime.SessionOptions) -> onnxruntime.InferenceSession | None:
@@ -142,8 +159,78 @@ def _open_cached(model: Path, options: onnxruntime.SessionOptions) -> onnxruntim
         options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_ALL
 
 
-def run_session(session: onnxruntime.InferenceSession, feeds: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Run a graph on the feeds that it takes, and return its outputs by name."""
+def run_session(
+    session: onnxruntime.InferenceSession,
+    feeds: dict[str, np.ndarray],
+    outputs: Sequence[str] | None = None,
+    limit_s: float | None = None,
+) -> dict[str, np.ndarray]:
+    """Run a graph on the feeds that it takes, and return its outputs, or those named, by name.
+
+    limit_s: seconds after which the run is ended; None for no limit. It is ended between two operators: one that never
+    ends by itself cannot be.
+    Raises InputError if an input is missing, the graph cannot run on these feeds, or it did not end in time.
+    """
+    missing = [entry.name for entry in session.get_inputs() if entry.name not in feeds]
+    if missing:
+        raise InputError(f"the graph needs the input {missing[0]}, which is not given; export the model again")
     wanted = {entry.name: feeds[entry.name] for entry in session.get_inputs()}
-    outputs = [entry.name for entry in session.get_outputs()]
-    return dict(zip(outputs, session.run(outputs, wanted), strict=True))
+    names = [entry.name for entry in session.get_outputs()] if outputs is None else list(outputs)
+    options = onnxruntime.RunOptions()
+    options.log_severity_level = FATAL_ONLY
+    ended = threading.Event()
+    watchdog = _watchdog(options, ended, limit_s)
+    try:
+        found = session.run(names, wanted, options)
+    except Exception as error:  # of many kinds, as above; also where memory runs out
+        if ended.is_set():
+            late = f"the graph did not end within {limit_s:g} s and was stopped"
+            raise InputError(f"{late}; allow more by the environment variable {LIMIT_VARIABLE}=SECONDS") from None
+        raise InputError(f"ONNX Runtime cannot run the graph ({_reason(error)}){_remedy(error)}") from None
+    finally:
+        if watchdog is not None:
+            watchdog.cancel()
+    return dict(zip(names, found, strict=True))
+
+
+def run_limit_s(pixels: int) -> float:
+    """Seconds that a graph may run on views of so many pixels together; raises InputError for a limit that is none."""
+    given = os.environ.get(LIMIT_VARIABLE)
+    if given is None:
+        return LONGEST_RUN_S + LONGEST_RUN_S_PER_PIXEL * pixels
+    try:
+        limit = float(given)
+    except ValueError:
+        limit = 0.0
+    if not 0 < limit <= threading.TIMEOUT_MAX:
+        raise InputError(f"{LIMIT_VARIABLE} is {given}: expected the seconds that a model may run, such as 3600")
+    return limit
+
+
+def _watchdog(options: onnxruntime.RunOptions, ended: threading.Event, limit_s: float | None) -> threading.Timer | None:
+    """A thread that has the run with these options end once its time is over."""
+    if limit_s is None:
+        return None
+
+    def end() -> None:
+        ended.set()
+        options.terminate = True
+
+    timer = threading.Timer(limit_s, end)
+    timer.daemon = True  # a command that is interrupted does not wait for it
+    timer.start()
+    return timer
+
+
+def _reason(error: Exception) -> str:
+    """ONNX Runtime's message in one line, without status codes and places in its source code."""
+    text = " ".join(str(error).split())
+    _, found, message = text.partition("Status Message: ")
+    reason = SOURCE.sub("", message if found else text.split(" : ")[-1])
+    return reason if len(reason) <= LONGEST_REASON else reason[:LONGEST_REASON] + "..."
+
+
+def _remedy(error: Exception) -> str:
+    if isinstance(error, MemoryError) or any(sign in str(error) for sign in OUT_OF_MEMORY):
+        return ": there is not enough memory; use fewer views or a smaller size"
+    return "; is it damaged? export it again"

@@ -24,6 +24,7 @@ from .errors import InputError, refuse
 from .files import check_expansion, read_bytes, replacing
 from .gaussians import Gaussians, check_finite, check_ranges
 from .morton import morton_order
+from .ply_header import OFFSET, checked_offset
 from .quantization import nearest_bytes
 from .quaternions import from_smallest_three, smallest_three, unit_quaternions
 
@@ -44,9 +45,10 @@ WEBP = struct.Struct("<4sI8sIBI")
 WEBP_SIGNATURE = 0x2F
 
 
-def write_sog(path: Path, gaussians: Gaussians) -> list[str]:
+def write_sog(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None) -> list[str]:
     """Write Gaussians as a .sog; the file appears whole or not at all.
 
+    offset: what was subtracted from the world coordinates, [3], which `asset` in meta.json records.
     Returns a line for each thing that the format cannot hold. Raises InputError if a value is not finite or not in our
     units, or the file cannot be written.
     """
@@ -57,6 +59,8 @@ def write_sog(path: Path, gaussians: Gaussians) -> list[str]:
     gaussians = gaussians.taken(morton_order(gaussians.means))
     files: dict[str, bytes] = {}
     meta: dict[str, Any] = {"version": VERSION, "asset": {"generator": "idesplat"}, "count": len(gaussians)}
+    if offset is not None and offset.any():
+        meta["asset"][OFFSET] = offset.tolist()
 
     logs = np.sign(gaussians.means) * np.log1p(np.abs(gaussians.means.astype(np.float64)))
     low, high = logs.min(axis=0), logs.max(axis=0)
@@ -99,6 +103,25 @@ def read_sog(path: Path) -> Gaussians:
         refuse(path, f"not a .sog as it should be ({type(error).__name__}: {str(error)[:60]})", "write it again")
     check_finite(path, gaussians)
     return gaussians
+
+
+def sog_offset(path: Path) -> np.ndarray:
+    """What a .sog says was subtracted from its coordinates, float64 [3]; zeros where it says nothing.
+
+    Raises InputError as `read_sog`.
+    """
+    content = read_bytes(path, EXPECTED)
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            asset = _Reader(path, archive, len(content)).meta.get("asset")
+    except InputError:
+        raise
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, struct.error):
+        refuse(path, "not a zip archive, or damaged", f"expected {EXPECTED}")
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        refuse(path, f"not a .sog as it should be ({type(error).__name__}: {str(error)[:60]})", "write it again")
+    found = asset.get(OFFSET) if isinstance(asset, dict) else None
+    return np.zeros(3) if found is None else checked_offset(path, found)
 
 
 def _coded(values: np.ndarray, name: str, alpha: np.ndarray | None = None) -> tuple[bytes, dict[str, Any]]:

@@ -55,6 +55,7 @@ def view(
         _check_page(html, scene, cameras, [*(images or []), *(more_images or [])])
     gaussians = read_scene(scene)
     viewpoints = read_viewpoints(cameras, camera_format, [*(images or []), *(more_images or [])])
+    viewpoints = _relative(viewpoints, scene)
     if html is None:
         from .serving import address
         from .viewer import serving
@@ -105,6 +106,15 @@ def _check_page(html: Path, scene: Path, cameras: Path | None, images: list[Path
     run.reads("the cameras", camera_files(cameras) if cameras else [])
     run.reads("a photograph", given_images(images))
     run.writes("--html", [html])
+
+
+def _relative(viewpoints: "list[Viewpoint]", scene: Path) -> "list[Viewpoint]":
+    """The viewpoints in the world of a scene that was written relative to an offset."""
+    from .cameras import relative_cameras
+    from .formats import read_offset
+
+    cameras = relative_cameras([viewpoint.camera for viewpoint in viewpoints], read_offset(scene))
+    return [viewpoint._replace(camera=camera) for viewpoint, camera in zip(viewpoints, cameras, strict=True)]
 
 
 def read_viewpoints(cameras: Path | None, form: CameraFormat | None, images: list[Path]) -> "list[Viewpoint]":

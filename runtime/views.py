@@ -2,7 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -34,6 +34,7 @@ class Views:
     intrinsics: float32, row 0 divided by the width and row 1 by the height, [views, 3, 3].
     cameras: the same cameras undistorted, at the full size of the pictures, [views].
     choice: how these views were chosen of more, in words; empty where there was no choice.
+    offset: what was subtracted from the user's world coordinates, float64 [3]; see `world_offset`.
     """
 
     names: list[str]
@@ -42,6 +43,7 @@ class Views:
     intrinsics: np.ndarray
     cameras: list[Camera]
     choice: str = ""
+    offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
 
 def match(images: Sequence[Path], cameras: Sequence[Camera]) -> list[tuple[Path, Camera]]:
@@ -130,8 +132,10 @@ def choose_pairs(pairs: Sequence[Pair], count: int) -> tuple[list[Pair], str]:
     return [pairs[index] for index in chosen], choice
 
 
-def check_views(images: Any, extrinsics: Any, intrinsics: Any, near: Any, far: Any) -> None:
+def check_views(images: Any, extrinsics: Any, intrinsics: Any, near: Any = None, far: Any = None) -> None:
     """Check what the network is given, as `Views` describes it; near and far are one number or one for each view.
+
+    What is None of them is yet to be found.
 
     Raises InputError naming the argument and the view: wrong shape or type, NaN, a pose that is not rigid, intrinsics
     that are not normalised, pixels outside [0, 1], not 0 < near < far, fewer than two views, cameras that coincide.
@@ -234,13 +238,18 @@ def _floats(array: Any, name: str, expected: str, shape: tuple[int | None, ...])
 
 def _check_range(near: Any, far: Any, views: int) -> None:
     for name, value in (("near", near), ("far", far)):
+        if value is None:
+            continue
         array = np.asarray(value)
         if array.dtype.kind not in "fiu" or array.shape not in ((), (views,)):
             raise InputError(f"{name}: {array.dtype}, shape {array.shape}, expected a number, or {views} of them")
         if not np.isfinite(array).all():
             raise InputError(f"{name}: holds NaN or infinity, expected finite distances")
+        if array.min() <= 0:
+            least = f"{name}: {array.min():g}"
+            raise InputError(f"{least}, expected a distance above 0, in the unit of the camera positions")
+    if near is None or far is None:
+        return
     nearest, farthest = np.broadcast_arrays(np.asarray(near), np.asarray(far))
-    if nearest.min() <= 0:
-        raise InputError(f"near: {nearest.min():g}, expected a distance above 0, in the unit of the camera positions")
     if (farthest <= nearest).any():
         raise InputError(f"far: {farthest.min():g}, expected beyond near, which is {nearest.max():g}")

@@ -121,7 +121,7 @@ def test_chunks_give_the_papers_means(workplace: Path, opened: Runner, capsys: C
     assert content["mean"]["model"]["psnr"] == pytest.approx(np.mean(values))
     (case,) = chunk_cases([Path("chunks/000000.torch")], {"b": Entry([0, 4], [2])}, (64, 96), (0.5, 100.0), print)
     given = case.context
-    prediction = opened.predict_arrays(given.images, given.extrinsics, given.intrinsics)
+    prediction = opened.predict_arrays(given.images, given.extrinsics, given.intrinsics, 0.5, 100.0)
     truth = case.targets.picture(0)
     # the releases draw nothing before a fifth of the near plane
     drawn = drawn_from(prediction.gaussians, case.targets.extrinsics[0], case.targets.K(0), near=0.2 * 0.5)

@@ -14,6 +14,7 @@ from idesplat.runtime import InputError, Runner, read_cameras
 from idesplat.runtime.bundle import INPUTS
 from idesplat.runtime.images import load_image
 from idesplat.runtime.session import open_session, provider_name
+from idesplat.runtime.views import prepare
 
 ROOT = Path(__file__).parent.parent
 
@@ -36,6 +37,76 @@ def test_predict_takes_photographs_and_cameras(runner, scene):
     assert from_files.depth.shape == (2, 64, 96)
     assert len(from_files.gaussians) == 2 * 64 * 96
     np.testing.assert_array_equal(from_files.depth, from_arrays.depth)
+
+
+def test_floating_point_images_are_not_darkened(runner, scene):
+    """The same photograph, as bytes and as floating point in [0, 1]."""
+    cameras = read_cameras(scene / "transforms.json")[:2]
+    images = [load_image(scene / camera.name) for camera in cameras]
+    expected = runner.predict(images, cameras)
+    for dtype in (np.float32, np.float64):
+        found = runner.predict([image.astype(dtype) / 255 for image in images], cameras)
+        np.testing.assert_array_equal(found.depth, expected.depth)
+        np.testing.assert_array_equal(found.gaussians.sh, expected.gaussians.sh)
+
+
+@pytest.mark.parametrize(
+    "change",
+    (
+        lambda image: image.astype(np.float32),  # 0 to 255
+        lambda image: image.astype(np.float32) / 127.5 - 1,
+        lambda image: image.astype(np.uint16),
+        lambda image: image.astype(np.int64),
+        lambda image: image > 127,
+        lambda image: image[..., 0],
+        lambda image: image.transpose(2, 0, 1),
+        lambda image: np.dstack([image, image[..., :1]]),
+        lambda image: np.where(image > 200, np.nan, image / 255),
+        lambda image: image[:0],
+    ),
+)
+def test_images_that_may_mean_anything_are_refused(runner, scene, change):
+    cameras = read_cameras(scene / "transforms.json")[:2]
+    images = [load_image(scene / camera.name) for camera in cameras]
+    with pytest.raises(InputError, match=r"001\.png: an image of .*expected RGB .* uint8 in 0 to 255 or as floating"):
+        runner.predict([images[0], change(images[1])], cameras)
+
+
+def test_without_near_and_far_the_unit_does_not_matter(runner, scene):
+    """A scene in millimetres: the model's own range, 0.5 to 100, would end before the nearest wall."""
+    cameras = read_cameras(scene / "transforms.json")[:2]
+    views = prepare([(scene / camera.name, camera) for camera in cameras], None, 64, 96)
+    arrays = views.images, views.extrinsics, views.intrinsics
+    expected = runner.predict_arrays(*arrays)
+    millimetres = views.extrinsics.copy()
+    millimetres[:, :3, 3] *= 1000
+    found = runner.predict_arrays(views.images, millimetres, views.intrinsics)
+    assert (np.abs(found.depth / 1000 - expected.depth) < 1e-3 * expected.depth).mean() > 0.99
+    spans = [prediction.cameras[0].depth_range for prediction in (expected, found)]
+    np.testing.assert_allclose(np.array(spans[1]) / 1000, spans[0], rtol=1e-3)
+    given = runner.predict_arrays(views.images, millimetres, views.intrinsics, near=np.array([900.0, 1000.0]))
+    assert given.cameras[1].depth_range == (1000, pytest.approx(spans[1][1]))
+
+
+def test_without_points_in_common_the_baseline_tells_near_and_far(runner, arrays):
+    arrays["images"][:] = 0.5
+    arrays["extrinsics"][:, :3, 3] *= 1000
+    baseline = np.linalg.norm(np.subtract(*arrays["extrinsics"][:, :3, 3]))
+    assert runner.predict_arrays(**arrays).cameras[0].depth_range == pytest.approx((baseline, 200 * baseline))
+
+
+def test_predictions_carry_the_cameras_of_their_depth(runner, scene):
+    """At the network's size, so that they lead from depth to points."""
+    cameras = read_cameras(scene / "transforms.json")[:2]
+    own = runner.predict([scene / camera.name for camera in cameras], cameras, 1, 20, (64, 64)).cameras
+    for camera, original in zip(own, cameras, strict=True):
+        assert camera.name == Path(original.name).name
+        assert (camera.width, camera.height, camera.depth_range) == (64, 64, (1, 20))
+        assert camera.distortion is None
+        np.testing.assert_array_equal(camera.extrinsics, original.extrinsics)
+        # 128 x 96 becomes 85 x 64, of which 10 columns are cut off at the left
+        matrix = np.array([[85 / 128, 0, -10], [0, 64 / 96, 0], [0, 0, 1]])
+        np.testing.assert_allclose(camera.K, matrix @ original.K, rtol=1e-5)
 
 
 def test_near_and_far_bound_the_depth(runner, arrays):

@@ -178,12 +178,12 @@ def exported(model: Path, provider: str, threads: int, workload: Workload) -> Pr
     started = time.perf_counter()
     runner = Runner(model, provider, Tuning(threads))
     load_seconds = time.perf_counter() - started
-    images, extrinsics, intrinsics, *_ = example_arrays(workload, runner.description.near, runner.description.far)
+    arrays = example_arrays(workload, runner.description.near, runner.description.far)
 
     def run() -> None:
-        runner.predict_arrays(images, extrinsics, intrinsics)
+        runner.predict_arrays(*arrays)
 
-    depth = runner.predict_arrays(images, extrinsics, intrinsics).depth
+    depth = runner.predict_arrays(*arrays).depth
     return {"load_seconds": load_seconds, "depth": depth}, run
 
 
@@ -251,9 +251,9 @@ def _profile(model: Path, provider: str, threads: int, workload: Workload, optim
 
     with scratch_folder() as folder:
         runner = Runner(model, provider, Tuning(threads, folder / "profile", optimise))
-        images, extrinsics, intrinsics, *_ = example_arrays(workload, runner.description.near, runner.description.far)
+        arrays = example_arrays(workload, runner.description.near, runner.description.far)
         for _ in range(TIMES_PROFILED if optimise else 1):
-            runner.predict_arrays(images, extrinsics, intrinsics)
+            runner.predict_arrays(*arrays)
         return [kernel for path in runner.end_profiling() for kernel in last_kernels(path)]
 
 

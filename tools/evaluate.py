@@ -28,6 +28,7 @@ if TYPE_CHECKING:  # nothing heavy is loaded before there is something to evalua
 PICTURED = 8
 # Of a procedural scene.
 TARGETS = 2
+DEFAULT_VIEWS = 2
 HELD_OUT_SCENES = 200
 
 Skip = Callable[[str, str], None]
@@ -52,7 +53,9 @@ def scene(
     model: Model = None,
     context: Annotated[list[str] | None, typer.Option(help="A photograph to infer from; give two or more.")] = None,
     target: Annotated[list[str] | None, typer.Option(help="A photograph to hold out; give one or more.")] = None,
-    views: Annotated[int, typer.Option(help="Photographs around each target, without --context.", min=2)] = 2,
+    views: Annotated[
+        int | None, typer.Option(help="Photographs around each target, without --context; 2 by default.", min=2)
+    ] = None,
     hold_out_every: Annotated[int, typer.Option(help="Hold out one of so many, without --target.", min=2)] = 8,
     depth: Annotated[Path | None, typer.Option(help="Folder of true depth, as make_scene writes it.")] = None,
     size: Size = None,
@@ -61,6 +64,8 @@ def scene(
     overwrite: Overwrite = False,
 ) -> None:
     """Hold photographs out, infer from others, and compare; beside the nearest photograph and the best plane."""
+    if views is not None and context:
+        raise InputError("--views and --context: expected one of them; --context names the views that there are")
     from ..runtime.cameras import read_cameras
     from ..runtime.images import find_images
     from ..runtime.views import match
@@ -72,7 +77,8 @@ def scene(
     found = find_images([images])
     frames = match(found, read_cameras(cameras, found))
     runner = _runner(model, out, [*found, *camera_files(cameras)])
-    chosen = chosen_frames(frames, context or [], target or [], runner.description.fixed_views or views, hold_out_every)
+    count = runner.view_count(views, None, DEFAULT_VIEWS) or DEFAULT_VIEWS
+    chosen = chosen_frames(frames, context or [], target or [], count, hold_out_every)
     shape = parse_size(size) if size else runner.size_for([camera for _, camera in frames])
     for sources, held_out in chosen:
         runner.check_size(len(sources), *shape)

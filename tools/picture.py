@@ -33,8 +33,7 @@ def picture(
     height, width = runner.size_for(cameras)
     pairs = [(scene / cameras[view].name, cameras[view]) for view in (*CONTEXT, BETWEEN)]
     given = prepare(pairs[: len(CONTEXT)], None, height, width)
-    span = runner.depth_range(given)
-    found = runner.predict_arrays(given.images, given.extrinsics, given.intrinsics, span.near, span.far)
+    found = runner.predict_views(given)
     views = prepare(pairs, None, height, width)
     pixels = views.intrinsics[-1].astype(np.float64) * np.array([width, height, 1.0])[:, None]
     between = draw_view(found.need_gaussians(), views.extrinsics[-1], pixels, width, height).rgb
