@@ -88,7 +88,7 @@ def _two_cameras(first: Photograph, second: Photograph) -> tuple[list[Camera], n
         )
     first_rays = rays_of(first.features.places[matches[:, 0]], Ks[0])
     second_rays = rays_of(second.features.places[matches[:, 1]], Ks[1])
-    tolerance = PIXELS_OFF * max(1.0, max(first.width, first.height) / LONGEST_SIDE) / Ks[0][0, 0]
+    tolerance = float(np.mean([_tolerance(*seen) for seen in zip((first, second), Ks, strict=True)]))
     if explained_by_turning(first_rays, second_rays, tolerance) > MOST_BY_TURNING:
         raise _same_place(pair, 0.0)
     found = _checked(estimate_pose(first_rays, second_rays, tolerance), pair, len(matches))
@@ -99,6 +99,12 @@ def _two_cameras(first: Photograph, second: Photograph) -> tuple[list[Camera], n
         for photograph, K, pose, depth in zip((first, second), Ks, (np.eye(4), extrinsics), depths, strict=True)
     ]
     return cameras, np.concatenate(depths)
+
+
+def _tolerance(photograph: Photograph, K: np.ndarray) -> float:
+    """How far from its epipolar line a match may lie in this photograph, on the plane z = 1."""
+    working_pixel = max(1.0, max(photograph.width, photograph.height) / LONGEST_SIDE)
+    return PIXELS_OFF * working_pixel / float(K[0, 0])
 
 
 def _pinhole(photograph: Photograph) -> np.ndarray:
