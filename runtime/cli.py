@@ -38,9 +38,11 @@ CLEANING = "Cleaning (off unless asked for)"
 
 @exit_on_input_error
 def infer(
+    *,
     images: Annotated[
-        list[Path], typer.Option(help="Folder, glob or files of photographs, or a video.", show_default=False)
-    ],
+        list[Path] | None,
+        typer.Option(help="Folder, glob or files of photographs, or a video; else the images that the cameras name."),
+    ] = None,
     cameras: Annotated[
         str,
         typer.Option(
@@ -122,7 +124,7 @@ def infer(
     _check_outputs(out, (json_path, save_cameras, report), (save_depth, render))
     _check_range(near, far)
     cleaning = Cleaning(min_opacity, trim_border, trim_edges, min_confidence, merge_duplicates)
-    given = Request([*images, *(more_images or [])], cameras, camera_format, focal, frames, views, size)
+    given = Request([*(images or []), *(more_images or [])], cameras, camera_format, focal, frames, views, size)
     with working("loading the model"):
         runner = Runner(model or default_model(), provider)
     _check_fit(runner, out, cleaning, {"--render": render, "--report": report})

@@ -5,7 +5,6 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
@@ -16,7 +15,7 @@ from .errors import InputError
 from .limits import IMAGE_MEGAPIXELS
 
 # Pillow's names of what is read, whatever a file's suffix says.
-FORMATS = ("JPEG", "PNG", "WEBP", "BMP", "JPEG2000", "AVIF", "PPM", "HEIF")
+FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "JPEG2000", "AVIF", "PPM", "HEIF")
 HEIF = "HEIF"
 TIFF = "TIFF"
 TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
@@ -114,6 +113,16 @@ def opened(path: Path, file: BinaryIO) -> Iterator[Image.Image]:
         Image.MAX_IMAGE_PIXELS = allowed
 
 
+def exif_of(image: Image.Image) -> Image.Exif:
+    """The EXIF data of an image, empty where it has none; not of XMP, and without decoding, unlike `getexif`."""
+    if image.format == TIFF:
+        return image.getexif()
+    exif, content = Image.Exif(), image.info.get("exif")
+    if isinstance(content, bytes):
+        exif.load(content)
+    return exif
+
+
 def check_megapixels(what: str, width: int, height: int) -> None:
     """Raise InputError, beginning with `what`, if an image of this size has more pixels than the limit."""
     if width * height > IMAGE_MEGAPIXELS.value * 10**6:
@@ -131,13 +140,10 @@ def _check_pixels(path: Path, width: int, height: int) -> None:
 
 def _orientation(image: Image.Image) -> int:
     """What the EXIF data says of how the image is to be turned; 1 where it says nothing that is known."""
-    content = image.info.get("exif")
-    if not isinstance(content, bytes) or image.format == HEIF:  # libheif turns images itself
+    if image.format == HEIF:  # libheif turns images itself
         return UPRIGHT
-    exif = Image.Exif()
     try:
-        exif.load(content)
-        value = exif.get(ORIENTATION, UPRIGHT)
+        value = exif_of(image).get(ORIENTATION, UPRIGHT)
     except Exception:  # damaged metadata; the image may be whole
         return UPRIGHT
     return value if isinstance(value, int) and 1 <= value <= 8 else UPRIGHT
@@ -170,5 +176,6 @@ def _register_heif(path: Path) -> None:
     try:
         from pi_heif import register_heif_opener
     except ImportError:
-        raise InputError(f"{path}: is HEIC, for which pi-heif is needed; pip install pi-heif, or save as JPEG") from None
+        remedy = "pip install pi-heif, or save it as JPEG"
+        raise InputError(f"{path}: is a HEIC image, for which pi-heif is needed; {remedy}") from None
     register_heif_opener(thumbnails=False)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from .errors import InputError
 
 LARGEST_LIMIT = 10**12
+MOST_DIGITS = 18
 
 
 @dataclass(frozen=True)
@@ -48,5 +49,5 @@ SIDE_PIXELS = Limit("IDESPLAT_MAX_SIDE", 8192, "pixels")
 
 
 def whole_number(text: str) -> int | None:
-    """A number of ASCII digits, at most 18 of them; None for anything else, such as `²`, which `str.isdigit` accepts."""
-    return int(text) if text.isascii() and text.isdigit() and len(text) <= 18 else None
+    """A number of at most MOST_DIGITS ASCII digits; None for anything else, such as `²`, a digit to `str.isdigit`."""
+    return int(text) if text.isascii() and text.isdigit() and len(text) <= MOST_DIGITS else None

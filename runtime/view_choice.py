@@ -125,12 +125,12 @@ class Scorer:
         points = self.points[:, i]
         from_i, from_j = (points - self.centres[camera].T[..., None] for camera in (i, j))  # [3, pairs, points]
         rotation = self.rotations[j].transpose(1, 2, 0)[..., None]  # [3, 3, pairs, 1]
-        x, y, z = (sum(from_j[row] * rotation[row, column] for row in range(3)) for column in range(3))
+        x, y, z = ((from_j * rotation[:, column]).sum(axis=0) for column in range(3))
         depth = np.where(z > 0, z, np.inf)
-        u, v = (
-            self.focals[j, axis, None] * side / depth + self.principal[j, axis, None] for axis, side in enumerate((x, y))
-        )
-        inside = (z > 0) & (u >= 0) & (u <= self.sizes[j, 0, None]) & (v >= 0) & (v <= self.sizes[j, 1, None])
+        inside = z > 0
+        for axis, side in enumerate((x, y)):
+            pixel = self.focals[j, axis, None] * side / depth + self.principal[j, axis, None]
+            inside &= (pixel >= 0) & (pixel <= self.sizes[j, axis, None])
         chord = np.sqrt(((_unit(from_i) - _unit(from_j)) ** 2).sum(axis=0))
         angle = 2 * np.arcsin(np.minimum(chord / 2, 1))
         return inside.mean(axis=1), (inside * angle).sum(axis=1) / np.maximum(inside.sum(axis=1), 1)
@@ -159,7 +159,8 @@ def _promising_pairs(scorer: Scorer) -> np.ndarray:
     total = len(scorer.centres)
     right, down, forward = np.moveaxis(scorer.rotations, -1, 0)  # [cameras, 3] each
     distances = scorer.distances[:, None]
-    baseline = np.median(distances) * np.tan(np.radians(GOOD_PARALLAX_DEG))
+    baselines = distances * np.tan(np.radians(GOOD_PARALLAX_DEG))
+    baseline = np.median(baselines)
     half_view = np.median(distances * scorer.sizes / scorer.focals) / 2
     looked_at = (scorer.centres + distances * forward) / half_view
     tree = cKDTree(np.hstack([scorer.centres / baseline, looked_at]))
@@ -169,7 +170,7 @@ def _promising_pairs(scorer: Scorer) -> np.ndarray:
     cameras = np.repeat(np.arange(total), PARTNERS)
     pairs = []
     for offset in offsets:
-        wanted = np.hstack([(scorer.centres + distances / np.median(distances) * baseline * offset) / baseline, looked_at])
+        wanted = np.hstack([(scorer.centres + baselines * offset) / baseline, looked_at])
         partners = tree.query(wanted, PARTNERS)[1].ravel()
         pairs.append(np.stack([np.minimum(cameras, partners), np.maximum(cameras, partners)], axis=1))
     found = np.unique(np.concatenate(pairs), axis=0)
