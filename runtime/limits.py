@@ -37,7 +37,7 @@ class Limit:
     @property
     def remedy(self) -> str:
         """How to raise it, for the end of a message."""
-        return f"raise the limit with the environment variable {self.variable}, now {self.value} {self.unit}"
+        return f"set the environment variable {self.variable} to more than {self.value}"
 
 
 # Of one image or video frame. The largest photographs of telephones have 200; a decoded one takes 3 bytes a pixel.
