@@ -88,7 +88,6 @@ def load_image(path: Path) -> np.ndarray:
     Raises DamagedImage if it cannot be read, InputError if it has more pixels than the limit, which the header tells,
     or holds floating-point values.
     """
-    path = Path(path)
     try:
         content = read_bytes(path, "an image", LARGEST_FILE)
     except InputError as error:

@@ -14,7 +14,8 @@ def parse_size(text: str) -> tuple[int, int]:
     height, width = (side or 0 for side in sides)
     if max(height, width) > SIDE_PIXELS.value:
         raise InputError(
-            f"--size {text}: expected sides of {SIDE_PIXELS.value} pixels at most; make it smaller, or {SIDE_PIXELS.remedy}"
+            f"--size {text}: expected sides of {SIDE_PIXELS.value} pixels at most; choose a smaller one, or "
+            f"{SIDE_PIXELS.remedy}"
         )
     return height, width
 

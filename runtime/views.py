@@ -96,16 +96,17 @@ def prepare(
     left_out: list[str] = []
     while True:
         if len(usable) < FEWEST_VIEWS:
-            damaged = f", {len(left_out)} cannot be read ({left_out[0]})" if left_out else ""
+            unread = f", {len(left_out)} cannot be read ({left_out[0]})" if left_out else ""
             image = "1 image" if len(usable) == 1 else f"{len(usable)} images"
-            raise InputError(f"{image} with a camera, expected at least {FEWEST_VIEWS}{damaged}; add images")
+            raise InputError(f"{image} with a camera, expected at least {FEWEST_VIEWS}{unread}; add images")
         try:
             return _prepared(loader, usable, count, left_out)
         except DamagedImage as error:
-            if not leave_out_damaged:
+            damaged = {index for index in usable if isinstance(pairs[index][0], Path) and pairs[index][0] == error.path}
+            if not leave_out_damaged or not damaged:
                 raise
             left_out.append(str(error))
-            usable = [index for index in usable if pairs[index][0] is not error.path]
+            usable = [index for index in usable if index not in damaged]
 
 
 def take(pair: Pair, height: int, width: int) -> tuple[np.ndarray, np.ndarray, Camera]:
