@@ -4,31 +4,44 @@ import os
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
-from .images import SUFFIXES, find_images, load_image, stem
+from .image_header import image_size
+from .images import SUFFIXES, find_images, stem
 
 GIVE_PICTURES = "give the pictures with --images, which idesplat-cameras convert takes, too"
 
 
-def picture_size(name: str, folder: Path, pictures: Sequence[Path]) -> tuple[int, int] | None:
-    """Width and height of the picture that a camera names, or None where there is no such picture.
+class PictureSizes:
+    """Sizes of the pictures that cameras name.
 
-    It is the one among `pictures` with that name, whatever the suffix, or else a file relative to `folder`.
-    Raises InputError if the picture cannot be read.
+    A picture is the one among `pictures` with that name, whatever the suffix, or else a file relative to `folder`.
     """
-    wanted = stem(PurePosixPath(name.replace("\\", "/")))
-    given = [picture for picture in pictures if stem(picture) == wanted]
+
+    def __init__(self, folder: Path, pictures: Sequence[Path]) -> None:
+        self.folder = folder
+        self._given = {stem(picture): picture for picture in reversed(pictures)}
+
+    def size(self, name: str) -> tuple[int, int] | None:
+        """Width and height of the picture that a camera names, or None where there is no such picture.
+
+        Raises InputError if the picture cannot be read.
+        """
+        given = self._given.get(stem(PurePosixPath(name.replace("\\", "/"))))
+        candidates = [] if given is None else [given]
+        for candidate in (*candidates, *picture_paths(self.folder, name)):
+            if candidate.is_file():
+                return size_of(candidate)
+        return None
+
+
+def picture_paths(folder: Path, name: str) -> list[Path]:
+    """Where the picture that a camera names may lie, seen from a folder: names may lack the suffix."""
     beside = os.path.join(folder, name.replace("\\", "/"))
-    candidates = [*given, *(Path(beside + suffix) for suffix in ("", *SUFFIXES))]
-    for candidate in candidates:
-        if os.path.isfile(candidate):
-            return size_of(candidate)
-    return None
+    return [Path(beside + suffix) for suffix in ("", *SUFFIXES)]
 
 
 def size_of(picture: Path) -> tuple[int, int]:
-    """Width and height of a picture, upright; raises InputError if it cannot be read."""
-    height, width = load_image(picture).shape[:2]
-    return width, height
+    """Width and height of a picture, upright, from its header; raises InputError if it cannot be read."""
+    return image_size(picture)
 
 
 def pictures_in(folder: Path) -> list[Path]:

@@ -55,10 +55,11 @@ def _rows(path: Path) -> list[tuple[int, str, np.ndarray]]:
 
 def _size(names: Sequence[str], folder: Path, pictures: Sequence[Path]) -> tuple[int, int]:
     """The size of the first frame that has a picture: all are cut from one video."""
-    from .camera_pictures import GIVE_PICTURES, picture_size
+    from .camera_pictures import GIVE_PICTURES, PictureSizes
 
+    sizes = PictureSizes(folder, pictures)
     for name in names:
-        size = picture_size(name, folder, pictures)
+        size = sizes.size(name)
         if size is not None:
             return size
     raise InputError(

@@ -9,8 +9,9 @@ import json
 import math
 from collections import ChainMap
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,6 +19,9 @@ from .camera_fields import calibration, entries, image_name, number, pixels, pos
 from .cameras import Camera, located
 from .errors import InputError
 from .files import replacing
+
+if TYPE_CHECKING:
+    from .camera_pictures import PictureSizes
 
 FILE_NAME = "transforms.json"
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -34,6 +38,7 @@ def read(path: Path, pictures: Sequence[Path] = ()) -> list[Camera]:
     """Read the file; `pictures` give the sizes that it lacks. Raises InputError."""
     path = path / FILE_NAME if path.is_dir() else path
     document = read_json(path)
+    sizes = _Sizes(path.parent, pictures)
     cameras: list[Camera] = []
     shared_size: tuple[int, int] | None = None
     for index, frame in enumerate(entries(document, "frames")):
@@ -44,9 +49,9 @@ def read(path: Path, pictures: Sequence[Path] = ()) -> list[Camera]:
             if "w" in settings or "h" in settings:
                 size = pixels(settings, "w"), pixels(settings, "h")
             elif any(field in frame for field in INTRINSICS):
-                size = _size(name, path.parent, pictures)
+                size = sizes.size(name)
             else:  # intrinsics that are shared imply a size that is: one image is enough to know it
-                size = shared_size = shared_size or _size(name, path.parent, pictures)
+                size = shared_size = shared_size or sizes.size(name)
             fisheye = _is_fisheye(settings)
             distortion = _distortion(settings, fisheye)
             extrinsics = pose(frame, "transform_matrix") @ OPENGL_TO_OPENCV
@@ -121,13 +126,24 @@ def _focal(settings: Mapping[str, Any], field: str, size: int) -> float:
     return 0.5 * size / math.tan(0.5 * angle)
 
 
-def _size(name: str, folder: Path, pictures: Sequence[Path]) -> tuple[int, int]:
-    from .camera_pictures import picture_size  # loads OpenCV, which few of these files need
+class _Sizes:
+    """Sizes of images that the file does not tell."""
 
-    size = picture_size(name, folder, pictures)
-    if size is None:
-        raise InputError(f"w and h are missing, and there is no image {folder / name} to take them from; add w and h")
-    return size
+    def __init__(self, folder: Path, pictures: Sequence[Path]) -> None:
+        self.folder, self.pictures = folder, pictures
+
+    @cached_property
+    def _found(self) -> "PictureSizes":
+        from .camera_pictures import PictureSizes  # loads OpenCV, which few of these files need
+
+        return PictureSizes(self.folder, self.pictures)
+
+    def size(self, name: str) -> tuple[int, int]:
+        size = self._found.size(name)
+        if size is None:
+            image = self.folder / name
+            raise InputError(f"w and h are missing, and there is no image {image} to take them from; add w and h")
+        return size
 
 
 def _frame(camera: Camera) -> dict[str, Any]:

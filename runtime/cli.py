@@ -45,9 +45,11 @@ CLEANING = "Cleaning (off unless asked for)"
 @exit_on_input_error
 @guards_outputs("idesplat-infer")
 def infer(
+    *,
     images: Annotated[
-        list[Path], typer.Option(help="Folder, glob or files of photographs, or a video.", show_default=False)
-    ],
+        list[Path] | None,
+        typer.Option(help="Folder, glob or files of photographs, or a video; else the images that the cameras name."),
+    ] = None,
     cameras: Annotated[
         str,
         typer.Option(
@@ -144,7 +146,7 @@ def infer(
     from .runner import Runner
 
     started = time.perf_counter()
-    given = Request([*images, *(more_images or [])], cameras, camera_format, focal, frames, views, size)
+    given = Request([*(images or []), *(more_images or [])], cameras, camera_format, focal, frames, views, size)
     if cameras == ESTIMATE and save_cameras is None:
         save_cameras = _beside(out, ESTIMATED_CAMERAS)
     model = model or default_model()

@@ -1,21 +1,18 @@
 """Near and far: from what the cameras are known to see, from points matched between the views, or from the baseline."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
-import cv2
 import numpy as np
 
-from .cameras import Camera, invert_rigid, located, resized
+from .cameras import Camera, invert_rigid
 from .errors import InputError
-from .images import load_image, undistort
 from .matching import Features, epipolar_error, find_features, match_features, parallax, rays_of, triangulate
 from .sparse_depth import FEWEST_POINTS, range_of_depths
-from .view_choice import compare, guess_distances
+from .view_choice import Scorer, guess_distances
+from .view_loader import Sample
 
-# Pictures looked at to find how far away a scene is, each with two others, and their longer side in pixels.
-SAMPLES, SAMPLE_SIDE = 3, 640
+SAMPLES = 3  # images looked at to find how far away a scene is, each with two others
 EPIPOLAR_ERROR = 1.5  # pixels
 SMALLEST_PARALLAX_DEG = 0.3  # below, a triangulated depth is noise
 
@@ -37,9 +34,11 @@ def find_depth_range(
     trained: tuple[float, float],
     near: float | None = None,
     far: float | None = None,
+    samples: Sequence[Sample] = (),
 ) -> DepthRange:
     """Near and far of these views; what is given stays.
 
+    samples: the views' images in which features are looked for, instead of the smaller `images`; none, or one for each.
     Ranges that the cameras know go first, then points matched between the views and triangulated. Where there are too
     few of them, near is the longest distance of a view from its nearest neighbour: what is closer is seen from
     directions so different that nothing would match; far is then as many times near as in `trained`, the near and far
@@ -48,7 +47,7 @@ def find_depth_range(
     """
     if near is not None and far is not None:
         return _checked(DepthRange(near, far, "given"))
-    found = _known(cameras) or _matched(images, extrinsics, intrinsics) or _from_baseline(extrinsics, trained)
+    found = _known(cameras) or _matched(images, extrinsics, intrinsics, samples) or _from_baseline(extrinsics, trained)
     if near is not None:
         found = DepthRange(near, found.far, f"near given, far from {found.source}")
     elif far is not None:
@@ -74,17 +73,32 @@ def _known(cameras: Iterable[Camera]) -> DepthRange | None:
     )
 
 
-def _matched(images: np.ndarray, extrinsics: np.ndarray, intrinsics: np.ndarray) -> DepthRange | None:
-    height, width = images.shape[2:]
-    pictures = np.rint(np.clip(images, 0, 1) * 255).astype(np.uint8).transpose(0, 2, 3, 1)
-    features = [find_features(np.ascontiguousarray(picture)) for picture in pictures]
-    K = np.array([[width], [height], [1]]) * intrinsics.astype(np.float64)  # [views, 3, 3]
+def _matched(
+    images: np.ndarray, extrinsics: np.ndarray, intrinsics: np.ndarray, samples: Sequence[Sample]
+) -> DepthRange | None:
+    if samples:
+        features = [_inside(sample, normal) for sample, normal in zip(samples, intrinsics, strict=True)]
+        K = np.stack([sample.camera.K for sample in samples])
+    else:
+        height, width = images.shape[2:]
+        pictures = np.rint(np.clip(images, 0, 1) * 255).astype(np.uint8).transpose(0, 2, 3, 1)
+        features = [find_features(np.ascontiguousarray(picture)) for picture in pictures]
+        K = np.array([[width], [height], [1]]) * intrinsics.astype(np.float64)  # [views, 3, 3]
     depths = [np.zeros(0)]
     for i, j in neighbours(extrinsics):
         depths += depths_of_pair(features[i], features[j], K[i], K[j], invert_rigid(extrinsics[j]) @ extrinsics[i])
     depth = np.concatenate(depths)  # two depths for each point
     found = range_of_depths(depth)
     return found and DepthRange(*found, f"{len(depth) // 2} points matched between the photographs")
+
+
+def _inside(sample: Sample, intrinsics: np.ndarray) -> Features:
+    """The features of a sample that lie in what the network takes of the image; its normalised intrinsics [3, 3]."""
+    features = sample.features
+    rays = rays_of(features.places, sample.camera.K)
+    normal = rays * np.diag(intrinsics)[:2] + intrinsics[:2, 2]
+    inside = ((normal >= 0) & (normal <= 1)).all(axis=1)
+    return Features(features.places[inside], features.descriptors[inside])
 
 
 def depths_of_pair(
@@ -119,44 +133,34 @@ def _from_baseline(extrinsics: np.ndarray, trained: tuple[float, float]) -> Dept
     return DepthRange(baseline, baseline * trained[1] / trained[0], "the baseline")
 
 
-def scene_distances(pairs: Sequence[tuple[Path | np.ndarray, Camera]]) -> tuple[np.ndarray, str]:
-    """How far from each picture's camera the scene is, [pictures], and how that is known, in words.
+def scene_distances(cameras: Sequence[Camera], sample: Callable[[int], Sample]) -> tuple[np.ndarray, str]:
+    """How far from each camera the scene is, [cameras], and how that is known, in words.
 
     In the middle of the depths that the camera is known to see; where that is not known, at the median depth of points
-    matched between a few of the pictures; where none match, as `guess_distances` has it.
-    Raises InputError if a picture cannot be read or does not fit its camera.
+    matched between a few of the images; where none match, as `guess_distances` has it.
+    sample: reads the image of the camera with this index; what it raises is raised.
     """
-    cameras = [camera for _, camera in pairs]
     distances = guess_distances(cameras)
     unknown = np.array([camera.depth_range is None for camera in cameras])
     if not unknown.any():
         return distances, "what the cameras are known to see"
-    depths = np.concatenate([np.zeros(0), *_sampled_depths(pairs, compare(cameras, distances).cost)])
+    depths = np.concatenate([np.zeros(0), *_sampled_depths(cameras, distances, sample)])
     if len(depths) < 2 * FEWEST_POINTS:
         return distances, "the directions of the cameras"
     return np.where(unknown, np.median(depths), distances), "points matched between a few photographs"
 
 
-def _sampled_depths(pairs: Sequence[tuple[Path | np.ndarray, Camera]], cost: np.ndarray) -> list[np.ndarray]:
-    """Depths of points that a few pictures share with the best partner by `cost` [pictures, pictures], and the next."""
-    samples = np.linspace(0, len(pairs) - 1, SAMPLES + 2)[1:-1].round().astype(int).tolist()
-    partners = [(i, j) for i in samples for j in (int(cost[i].argmin()), min(i + 1, len(pairs) - 1)) if i != j]
-    known = {index: _sample(*pairs[index]) for pair in partners for index in pair}
+def _sampled_depths(
+    cameras: Sequence[Camera], distances: np.ndarray, sample: Callable[[int], Sample]
+) -> list[np.ndarray]:
+    """Depths of points that a few images share with that of the best partner, and with the next one."""
+    scorer, everyone = Scorer(cameras, distances), np.arange(len(cameras))
     depths: list[np.ndarray] = []
-    for i, j in partners:
-        (first, first_camera), (second, second_camera) = known[i], known[j]
-        between = invert_rigid(second_camera.extrinsics) @ first_camera.extrinsics
-        depths += depths_of_pair(first, second, first_camera.K, second_camera.K, between)
+    for i in np.linspace(0, len(cameras) - 1, SAMPLES + 2)[1:-1].round().astype(int).tolist():
+        best = int(scorer.score(np.full(len(cameras), i), everyone).cost.argmin())
+        for j in (best, min(i + 1, len(cameras) - 1)):
+            if i != j:
+                first, second = sample(i), sample(j)
+                between = invert_rigid(cameras[j].extrinsics) @ cameras[i].extrinsics
+                depths += depths_of_pair(first.features, second.features, first.camera.K, second.camera.K, between)
     return depths
-
-
-def _sample(picture: Path | np.ndarray, camera: Camera) -> tuple[Features, Camera]:
-    """Features of a picture, undistorted and made small, and its camera."""
-    image = picture if isinstance(picture, np.ndarray) else load_image(picture)
-    with located(camera.name):
-        camera = resized(camera, image.shape[1], image.shape[0])
-    factor = min(1, SAMPLE_SIDE / max(image.shape[:2]))
-    width, height = max(1, round(camera.width * factor)), max(1, round(camera.height * factor))
-    image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    image, camera = undistort(image, resized(camera, width, height))
-    return find_features(image), camera

@@ -5,6 +5,7 @@ their axis in the middle of the picture. More take COLMAP's mapper. The world is
 unit the median depth of the points that were found, since photographs know no unit.
 """
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,12 +17,14 @@ from .camera_fields import calibration
 from .cameras import Camera, check_intrinsics, invert_rigid, located
 from .errors import InputError
 from .focal_length import exif_focal, given_focal
+from .image_header import DamagedImage
 from .images import load_image
 from .matching import Features, find_features, match_features, rays_of
 from .progress import progress, working
 from .sparse_depth import range_of_depths
 from .two_view import TwoViews, estimate_pose, explained_by_turning
 
+DECODED_BYTES = 1 << 29  # of images that are kept, so that those that are chosen later need not be read again
 LONGEST_SIDE = 1600  # pixels, in which features are looked for
 PIXELS_OFF = 1.5  # at that size: how far from its epipolar line a match may lie
 FEWEST_MATCHES = 40
@@ -41,31 +44,70 @@ class Photograph:
     focal: float | None
 
 
-def estimate_cameras(pictures: Sequence[Path], focal: str | None = None) -> list[Camera]:
+def estimate_cameras(
+    pictures: Sequence[Path],
+    focal: str | None = None,
+    left_out: list[str] | None = None,
+    decoded: dict[Path, np.ndarray] | None = None,
+) -> list[Camera]:
     """Cameras for photographs of one scene that does not move; of more than two, those that could be placed.
 
     focal: the focal length of all, in pixels (`1375`) or on 35 mm film (`26mm`); else each one's EXIF data tells, and
     with more than two photographs it is found where neither does.
+    left_out: receives a line for each photograph that is damaged or the same as another one, and is left out; where it
+    is None, that is an error. decoded: receives the photographs as they were read, up to DECODED_BYTES.
     The first camera is the world's origin, the median depth of what is seen is 1, and `depth_range` is set.
     Raises InputError for fewer than two photographs, two without focal length, too few common points, too little
     parallax, more than two photographs without pycolmap, or where nothing fits together.
     """
-    if len(pictures) < 2:
-        raise InputError(
-            f"--cameras estimate: {len(pictures)} photograph given, expected two at least; add photographs"
-        )
     if len(pictures) > 2:
-        from .mapping import check_mapper, place_photographs
+        from .mapping import check_mapper
 
         check_mapper(len(pictures))
-        photographs = [_see(picture, focal) for picture in progress(pictures, "finding features")]
+    left_out_lines: list[str] = []
+    photographs = _see_all(pictures, focal, left_out_lines, {} if decoded is None else decoded)
+    if left_out_lines and left_out is None:
+        raise InputError(left_out_lines[0])
+    if len(photographs) < 2:
+        why = f" that can be used ({left_out_lines[0]})" if left_out_lines else " given"
+        raise InputError(
+            f"--cameras estimate: {len(photographs)} photograph{why}, expected two at least; add photographs"
+        )
+    if left_out is not None:
+        left_out += left_out_lines
+    if len(photographs) > 2:
+        from .mapping import place_photographs
+
         return _in_unit(*place_photographs(photographs, refine_focal=focal is None))
     with working("finding the cameras"):
-        return _in_unit(*_two_cameras(_see(pictures[0], focal), _see(pictures[1], focal)))
+        return _in_unit(*_two_cameras(*photographs))
 
 
-def _see(picture: Path, focal: str | None) -> Photograph:
-    image = load_image(picture)
+def _see_all(
+    pictures: Sequence[Path], focal: str | None, left_out: list[str], decoded: dict[Path, np.ndarray]
+) -> list[Photograph]:
+    """The photographs with their features, without those that are damaged or the same as another one."""
+    photographs: list[Photograph] = []
+    seen: dict[bytes, Path] = {}
+    memory = 0
+    for picture in progress(pictures, "finding features"):
+        try:
+            image = load_image(picture)
+        except DamagedImage as error:
+            left_out.append(f"{error}; left out")
+            continue
+        same = seen.setdefault(hashlib.blake2b(image.data).digest(), picture)
+        if same is not picture:
+            left_out.append(f"{picture}: is the same image as {same}; left out")
+            continue
+        memory += image.nbytes
+        if memory <= DECODED_BYTES:
+            decoded[picture] = image
+        photographs.append(_see(picture, image, focal))
+    return photographs
+
+
+def _see(picture: Path, image: np.ndarray, focal: str | None) -> Photograph:
     height, width = image.shape[:2]
     scale = min(1.0, LONGEST_SIDE / max(height, width))
     small_size = max(1, round(width * scale)), max(1, round(height * scale))
@@ -88,7 +130,7 @@ def _two_cameras(first: Photograph, second: Photograph) -> tuple[list[Camera], n
         )
     first_rays = rays_of(first.features.places[matches[:, 0]], Ks[0])
     second_rays = rays_of(second.features.places[matches[:, 1]], Ks[1])
-    tolerance = PIXELS_OFF * max(1.0, max(first.width, first.height) / LONGEST_SIDE) / Ks[0][0, 0]
+    tolerance = float(np.mean([_tolerance(*seen) for seen in zip((first, second), Ks, strict=True)]))
     if explained_by_turning(first_rays, second_rays, tolerance) > MOST_BY_TURNING:
         raise _same_place(pair, 0.0)
     found = _checked(estimate_pose(first_rays, second_rays, tolerance), pair, len(matches))
@@ -99,6 +141,12 @@ def _two_cameras(first: Photograph, second: Photograph) -> tuple[list[Camera], n
         for photograph, K, pose, depth in zip((first, second), Ks, (np.eye(4), extrinsics), depths, strict=True)
     ]
     return cameras, np.concatenate(depths)
+
+
+def _tolerance(photograph: Photograph, K: np.ndarray) -> float:
+    """How far from its epipolar line a match may lie in this photograph, on the plane z = 1."""
+    working_pixel = max(1.0, max(photograph.width, photograph.height) / LONGEST_SIDE)
+    return PIXELS_OFF * working_pixel / float(K[0, 0])
 
 
 def _pinhole(photograph: Photograph) -> np.ndarray:

@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import BinaryIO, Protocol
 
 from .errors import InputError, refuse
+from .limits import EXPANSION
 
 try:
     import fcntl
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-# Compression reaches ratios of 1000, but no scene comes near these: what claims more would only fill the memory.
-MOST_EXPANSION = 64
+# What small files may take in memory, however well they are compressed.
 ALWAYS_ALLOWED = 1 << 26  # bytes
 SCRATCH_PREFIX = ".idesplat-tmp-"
 SCRATCH_NAME = re.compile(re.escape(SCRATCH_PREFIX) + r"\w{8}")  # as tempfile.mkdtemp completes it
@@ -152,10 +152,11 @@ def read_bytes(path: Path, expected: str, largest: int | None = None) -> bytes:
 
 
 def check_expansion(path: Path, unpacked: int, packed: int) -> None:
-    """Refuse a compressed file of `packed` bytes that claims to hold so much more, before it is unpacked."""
-    if unpacked > max(ALWAYS_ALLOWED, MOST_EXPANSION * packed):
+    """Refuse a file of `packed` bytes that claims to hold so many more, before they take memory."""
+    if unpacked > max(ALWAYS_ALLOWED, EXPANSION.value * packed):
         raise InputError(
-            f"{path}: {packed} bytes that claim to hold {unpacked} are no scene; copy or download it again"
+            f"{path}: {packed} bytes that claim to hold {unpacked} are no scene; copy or download it again, or "
+            f"{EXPANSION.remedy}"
         )
 
 

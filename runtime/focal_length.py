@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from .errors import InputError
+from .files import open_regular
 
 # The diagonal of 35 mm film, to which cameras relate the focal length that they note (CIPA DCG-001).
 FILM_DIAGONAL_MM = float(np.hypot(36, 24))
@@ -31,11 +32,11 @@ def exif_focal(path: Path, width: int, height: int) -> float | None:
 
     It is the one that the camera relates to 35 mm film, which holds for any size that the picture was scaled to.
     """
-    from PIL import Image
+    from .image_header import exif_of, opened
 
     try:
-        with Image.open(path) as image:
-            value = image.getexif().get_ifd(EXIF_DIRECTORY).get(FOCAL_LENGTH_35MM)
+        with open_regular(path) as file, opened(path, file) as image:
+            value = exif_of(image).get_ifd(EXIF_DIRECTORY).get(FOCAL_LENGTH_35MM)
         focal_mm = float(value) if value is not None else 0.0
     except Exception:  # of damaged metadata Pillow makes many kinds; the picture itself is read elsewhere
         return None

@@ -9,6 +9,7 @@ import numpy as np
 from .errors import InputError, refuse
 
 SH_0 = 0.28209479177387814  # the spherical harmonic of degree 0: colour is 0.5 + SH_0 * sh[:, 0]
+FLOAT32_BYTES, WITHOUT_SH = 4, 11  # numbers of a Gaussian beside its spherical harmonics
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,11 @@ class Gaussians:
     def colours(self) -> np.ndarray:
         """Red, green and blue without the part that changes with the direction, usually in [0, 1], [gaussians, 3]."""
         return 0.5 + np.float32(SH_0) * self.sh[:, 0]
+
+
+def bytes_in_memory(count: int, sh_degree: int) -> int:
+    """What so many Gaussians of this degree take."""
+    return count * FLOAT32_BYTES * (WITHOUT_SH + 3 * (sh_degree + 1) ** 2)
 
 
 def check_ranges(path: Path, gaussians: Gaussians) -> None:

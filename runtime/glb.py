@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from .errors import InputError, refuse
-from .files import read_bytes, replacing
+from .files import check_expansion, read_bytes, replacing
 from .frames import GLTF, half_turned
-from .gaussians import Gaussians, check_finite, check_ranges
+from .gaussians import Gaussians, bytes_in_memory, check_finite, check_ranges
 from .images_out import linear_colours, to_bytes
 from .ply_header import OFFSET, checked_offset
 from .quaternions import unit_quaternions
@@ -110,6 +110,7 @@ def _read_gaussians(path: Path, document: dict[str, Any], binary: bytes) -> Gaus
     """The Gaussians in glTF's frame; raises InputError, or KeyError and the like where the JSON is not as it should."""
     attributes = _splat_attributes(path, document)
     count = document["accessors"][attributes["POSITION"]]["count"]
+    degree = max(d for d in range(4) if set(_coefficients(d)) <= set(attributes))
 
     def read(name: str, kind: str) -> np.ndarray:
         values = _read_accessor(path, document, binary, attributes[name], kind)
@@ -117,9 +118,10 @@ def _read_gaussians(path: Path, document: dict[str, Any], binary: bytes) -> Gaus
             refuse(path, f"{len(values)} values of {name} for {count} splats", "write it again")
         return values
 
-    degree = max(d for d in range(4) if set(_coefficients(d)) <= set(attributes))
+    means = read("POSITION", "VEC3")
+    check_expansion(path, bytes_in_memory(count, degree), len(binary))  # accessors may share their bytes
     return Gaussians(
-        means=read("POSITION", "VEC3"),
+        means=means,
         scales=read(PREFIX + "SCALE", "VEC3"),
         quats=np.roll(read(PREFIX + "ROTATION", "VEC4"), 1, axis=1),
         opacities=read(PREFIX + "OPACITY", "SCALAR")[:, 0],

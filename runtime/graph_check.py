@@ -10,6 +10,7 @@ import numpy as np
 
 from .bundle import INPUTS, OUTPUTS, Description
 from .errors import InputError
+from .files import open_regular
 from .metadata_fields import shown
 
 FLOAT = "tensor(float)"
@@ -56,7 +57,7 @@ def check_file(path: Path) -> None:
 
 def _external_files(path: Path) -> Iterator[str]:
     """The names of the files that hold some of a graph's weights."""
-    with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as content:
+    with open_regular(path) as file, mmap(file.fileno(), 0, access=ACCESS_READ) as content:
         if LONG_LOCATION.search(content):
             raise InputError(f"{path}: keeps weights in a file whose name has more than 127 bytes; export it again")
         for found in {content[at.end() : at.end() + at.group(1)[0]] for at in LOCATION.finditer(content)}:

@@ -5,16 +5,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from .camera_format import ESTIMATE, CameraFormat
 from .cameras import Camera, read_cameras
 from .errors import InputError
 from .files import scratch_folder
-from .images import cover, stem
+from .images import cover, describe_unread, stem
 from .photographs import find_photographs
 from .progress import working
 from .runner import Runner
 from .sizes import nearest_size, parse_size
 from .view_choice import FEWEST_VIEWS
+from .view_loader import Pair
 from .views import Views, match, prepare
 
 DEFAULT_VIEWS = 2
@@ -54,17 +57,20 @@ def read_inputs(request: Request, runner: Runner) -> Inputs:
 
     Raises InputError for whatever cannot be used.
     """
+    notes = describe_unread(request.images)
     with scratch_folder() as folder:
         given = None if request.cameras == ESTIMATE else Path(request.cameras)
         images = find_photographs(request.images, given, request.camera_format, folder)
-        notes = []
+        decoded: dict[Path, np.ndarray] = {}
         if given is None:
             from .estimate import estimate_cameras
 
             images = pick_frames(images, request.frames)
             wanted = _wanted(request, runner, images)
-            cameras = estimate_cameras(images, request.focal)
-            notes.append(_estimated(len(images), cameras))
+            left_out: list[str] = []
+            cameras = estimate_cameras(images, request.focal, None if request.frames else left_out, decoded)
+            notes += left_out
+            notes.append(_estimated(len(images) - len(left_out), cameras))
             images = [Path(camera.name) for camera in cameras]
         else:
             with working("reading cameras"):
@@ -79,7 +85,9 @@ def read_inputs(request: Request, runner: Runner) -> Inputs:
         count = min(wanted or len(pairs), len(pairs))
         runner.check_size(max(count, FEWEST_VIEWS), height, width)
         with working("choosing and reading photographs"):
-            views = prepare(pairs, count, height, width)
+            read: list[Pair] = [(decoded.get(path, path), camera) for path, camera in pairs]
+            views = prepare(read, count, height, width, leave_out_damaged=request.frames is None)
+    notes += [f"{line}; left out" for line in views.left_out]
     if request.views and request.views > len(pairs):
         notes.append(f"--views {request.views}: all {len(pairs)} photographs used; there are no more with a camera")
     notes += _cut(views.cameras[0], height, width, runner)

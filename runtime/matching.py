@@ -28,7 +28,9 @@ class Features:
 def find_features(image: np.ndarray, most: int = MOST_FEATURES) -> Features:
     """SIFT features of a picture, uint8 RGB [height, width, 3] or grey [height, width]; maybe none."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
-    keypoints, descriptors = cv2.SIFT.create(most, contrastThreshold=CONTRAST).detectAndCompute(grey, None)
+    # Without the precise upscale, OpenCV's keypoints lie a quarter of a pixel too far to the right and down.
+    sift = cv2.SIFT.create(most, contrastThreshold=CONTRAST, enable_precise_upscale=True)
+    keypoints, descriptors = sift.detectAndCompute(grey, None)
     if descriptors is None:
         return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
     places = np.array([keypoint.pt for keypoint in keypoints]) + HALF_PIXEL

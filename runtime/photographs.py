@@ -1,24 +1,33 @@
-"""What --images stands for: photographs, or the frames of a video that cameras name."""
+"""What --images stands for: photographs, the frames of a video that cameras name, or what cameras themselves name."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 from . import video
 from .camera_format import CameraFormat
+from .camera_pictures import picture_paths
 from .cameras import read_cameras, recognise
 from .cameras_re10k import timestamps
 from .errors import InputError
 from .images import find_images
 
+# Where the images that a camera file names are looked for: in its own folder, and in these of it and of those above,
+# since COLMAP's models lie in `sparse/0`.
+IMAGE_FOLDERS = ("images", "image", "blended_images")
+FOLDERS_ABOVE = 3
+EXAMPLES = 3  # names in a message
+
 
 def find_photographs(
     given: Sequence[Path], cameras: Path | None, camera_format: CameraFormat | None, folder: Path
 ) -> list[Path]:
-    """The photographs that are given, or frames of a video, written to `folder`.
+    """The photographs that are given, or frames of a video, written to `folder`; where none are, those of the cameras.
 
-    cameras: where frames of a video are named; None for sharp ones. Raises InputError for what cannot be read, or a
-    video that is not alone.
+    cameras: where frames of a video are named; None for sharp ones. Raises InputError for what cannot be read or found,
+    or a video that is not alone.
     """
+    if not given:
+        return _named_photographs(cameras, camera_format)
     videos = [path for path in given if video.is_video(path)]
     if not videos:
         return find_images(given)
@@ -27,6 +36,29 @@ def find_photographs(
     if cameras is None:
         return video.sample_frames(videos[0], folder)
     return video.named_frames(videos[0], _names(cameras, camera_format), folder)
+
+
+def _named_photographs(cameras: Path | None, camera_format: CameraFormat | None) -> list[Path]:
+    """The photographs that cameras name, as far as they are there; raises InputError where none is."""
+    if cameras is None:
+        raise InputError("--images is missing: photographs without cameras are to be given")
+    names = _names(cameras, camera_format)
+    folder = cameras if cameras.is_dir() else cameras.parent
+    above = [folder, *folder.resolve().parents[:FOLDERS_ABOVE]]
+    for place in (folder, *(parent / name for parent in above for name in IMAGE_FOLDERS)):
+        found = [path for name in names if (path := _file(place, name)) is not None]
+        if found:
+            return found
+    shown = ", ".join(names[:EXAMPLES]) + (", ..." if len(names) > EXAMPLES else "")
+    raise InputError(
+        f"{cameras}: none of the {len(names)} images that it names ({shown}) is beside it or in `{IMAGE_FOLDERS[0]}`; "
+        "give --images"
+    )
+
+
+def _file(place: Path, name: str) -> Path | None:
+    """The image of this name, with its suffix or without, in a folder."""
+    return next((path for path in picture_paths(place, name) if path.is_file()), None)
 
 
 def _names(cameras: Path, camera_format: CameraFormat | None) -> list[str]:

@@ -104,7 +104,7 @@ def header_offset(path: Path) -> np.ndarray:
     Raises InputError if the file cannot be read, or what it says is no offset.
     """
     try:
-        with Path(path).open("rb") as file:
+        with open_regular(Path(path)) as file:
             while file.tell() < MAX_HEADER_BYTES:
                 words = file.readline(MAX_HEADER_BYTES).decode("ascii", errors="replace").split()
                 if words[:2] == ["comment", OFFSET] and len(words) == 5:

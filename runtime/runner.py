@@ -113,7 +113,7 @@ class Runner:
         """
         trained = self.description.near, self.description.far
         return find_depth_range(
-            views.images, views.extrinsics, views.intrinsics, views.cameras, trained, near=near, far=far
+            views.images, views.extrinsics, views.intrinsics, views.cameras, trained, near, far, views.samples
         )
 
     def predict_arrays(

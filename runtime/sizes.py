@@ -1,14 +1,23 @@
 """Image sizes as commands are given them and as networks take them."""
 
 from .errors import InputError
+from .limits import SIDE_PIXELS, whole_number
+
+SHOWN = 40  # characters of an option that a message repeats
 
 
 def parse_size(text: str) -> tuple[int, int]:
     """The option --size, `HEIGHTxWIDTH`, as two numbers; raises InputError."""
-    parts = text.lower().split("x")
-    if len(parts) != 2 or not all(part.isdigit() for part in parts):
-        raise InputError(f"--size {text}: expected HEIGHTxWIDTH, such as 256x256")
-    return int(parts[0]), int(parts[1])
+    sides = [whole_number(part) for part in text.lower().split("x")]
+    if len(sides) != 2 or not all(sides):
+        raise InputError(f"--size {text[:SHOWN]}: expected HEIGHTxWIDTH, such as 256x256")
+    height, width = (side or 0 for side in sides)
+    if max(height, width) > SIDE_PIXELS.value:
+        raise InputError(
+            f"--size {text}: expected sides of {SIDE_PIXELS.value} pixels at most; choose a smaller one, or "
+            f"{SIDE_PIXELS.remedy}"
+        )
+    return height, width
 
 
 def size_fits(height: int, width: int, multiple: int) -> bool:

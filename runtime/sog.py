@@ -22,7 +22,7 @@ import numpy as np
 from .codebooks import ENTRIES, codebook, nearest, palette
 from .errors import InputError, refuse
 from .files import check_expansion, read_bytes, replacing
-from .gaussians import Gaussians, check_finite, check_ranges
+from .gaussians import Gaussians, bytes_in_memory, check_finite, check_ranges
 from .morton import morton_order
 from .ply_header import OFFSET, checked_offset
 from .quantization import nearest_bytes
@@ -182,7 +182,7 @@ class _Reader:
         if archive.getinfo(META).file_size > MOST_META_BYTES:
             refuse(path, f"{META} is larger than {MOST_META_BYTES} bytes", "write it again")
         try:
-            self.meta = json.loads(archive.read(META))
+            self.meta = json.loads(self._unpacked(META))
         except (ValueError, RecursionError):
             refuse(path, f"{META} is not valid JSON", "copy or download it again")
         if self.meta["version"] != VERSION:
@@ -190,7 +190,21 @@ class _Reader:
         self.count = self.meta["count"]
         if type(self.count) is not int or self.count < 1:
             refuse(path, f"count is {str(self.count)[:20]}", "expected the number of Gaussians")
-        check_expansion(path, 4 * self.count, size)
+        check_expansion(path, bytes_in_memory(self.count, self._degree()), size)
+
+    def _degree(self) -> int:
+        """Degree of the spherical harmonics."""
+        if "shN" not in self.meta:
+            return 0
+        bands: int = self.meta["shN"]["bands"]
+        if bands not in (1, 2, 3):
+            refuse(self.path, f"harmonics of degree {str(bands)[:20]}", "expected 1 to 3; write it again")
+        return bands
+
+    def _unpacked(self, name: str) -> bytes:
+        """A file of the archive; never more bytes than the archive's directory says, which are checked."""
+        with self.archive.open(name) as file:
+            return file.read(self.archive.getinfo(name).file_size)
 
     def read(self) -> Gaussians:
         """All that the archive holds."""
@@ -218,10 +232,10 @@ class _Reader:
         """Spherical harmonics of degree 1 and above, [gaussians, coefficients, 3]."""
         if "shN" not in self.meta:
             return np.empty((self.count, 0, 3), np.float32)
-        sets, bands = self.meta["shN"]["count"], self.meta["shN"]["bands"]
-        if type(sets) is not int or not 1 <= sets <= MOST_SETS or bands not in (1, 2, 3):
-            refuse(self.path, f"{str(sets)[:20]} sets of harmonics of degree {str(bands)[:20]}", "write it again")
-        coefficients = (bands + 1) ** 2 - 1
+        sets = self.meta["shN"]["count"]
+        if type(sets) is not int or not 1 <= sets <= MOST_SETS:
+            refuse(self.path, f"{str(sets)[:20]} sets of harmonics", f"expected 1 to {MOST_SETS}; write it again")
+        coefficients = (self._degree() + 1) ** 2 - 1
         table = self._decoded("shN", 0, sets * coefficients)
         if table.shape[1] != SETS_A_ROW * coefficients:
             refuse(self.path, f"the picture of harmonics is {table.shape[1]} pixels wide", "write it again")
@@ -251,7 +265,7 @@ class _Reader:
         import cv2
 
         name = self.meta[field]["files"][index]
-        content = self.archive.read(name)
+        content = self._unpacked(name)
         _, _, kind, _, signature, sides = WEBP.unpack_from(content)
         width, height = (sides & 0x3FFF) + 1, (sides >> 14 & 0x3FFF) + 1
         if kind != b"WEBPVP8L" or signature != WEBP_SIGNATURE:

@@ -11,6 +11,8 @@ import cv2
 import numpy as np
 
 from .errors import InputError
+from .image_header import check_megapixels
+from .limits import whole_number
 from .progress import working
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
@@ -96,6 +98,9 @@ def _frames(video: Path) -> Iterator[tuple[int, cv2.VideoCapture]]:
         raise InputError(f"{video}: no such file, expected a video")
     capture = cv2.VideoCapture(str(video))
     try:
+        if capture.isOpened():
+            sides = (int(capture.get(side)) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+            check_megapixels(str(video), *sides)
         if not capture.isOpened() or not capture.grab():
             raise InputError(f"{video}: is damaged or not a video that OpenCV reads; save it as MP4 (H.264)")
         number = 0
@@ -119,8 +124,9 @@ def _number(name: str, video: Path, rate: float) -> int | None:
     stem = _stem(name)
     numbered = NUMBERED.fullmatch(stem)
     if numbered and numbered[1] == video.stem:
-        return int(numbered[2])
-    return round(int(stem) * rate / 1e6) if stem.isdecimal() and rate else None
+        return whole_number(numbered[2])
+    microseconds = whole_number(stem)
+    return round(microseconds * rate / 1e6) if microseconds is not None and rate else None
 
 
 def _stem(name: str) -> str:

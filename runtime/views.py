@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from .cameras import Camera, check_intrinsics, located, resized, rigid
+from .cameras import Camera, check_intrinsics, located, rigid
 from .depth_range import neighbours, scene_distances
 from .errors import InputError
-from .images import fit, load_image, stem, undistort
+from .image_header import DamagedImage
+from .images import stem
 from .view_choice import FEWEST_VIEWS, choose_views, compare
-
-Pair = tuple[Path | np.ndarray, Camera]  # a picture, as a file or as uint8 RGB [height, width, 3], and its camera
+from .view_loader import Pair, Sample, ViewLoader, load_view
 
 EXAMPLES = 3  # names listed in a message
 
@@ -35,6 +35,8 @@ class Views:
     cameras: the same cameras undistorted, at the full size of the pictures, [views].
     choice: how these views were chosen of more, in words; empty where there was no choice.
     offset: what was subtracted from the user's world coordinates, float64 [3]; see `world_offset`.
+    samples: the images in which features are looked for, [views]; empty where cameras know the depths that they see.
+    left_out: what is wrong with images that could not be read and were left out, a line for each.
     """
 
     names: list[str]
@@ -44,6 +46,8 @@ class Views:
     cameras: list[Camera]
     choice: str = ""
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    samples: Sequence[Sample] = ()
+    left_out: Sequence[str] = ()
 
 
 def match(images: Sequence[Path], cameras: Sequence[Camera]) -> list[tuple[Path, Camera]]:
@@ -78,24 +82,33 @@ def match(images: Sequence[Path], cameras: Sequence[Camera]) -> list[tuple[Path,
     return pairs
 
 
-def prepare(pairs: Sequence[Pair], count: int | None, height: int, width: int) -> Views:
+def prepare(
+    pairs: Sequence[Pair], count: int | None, height: int, width: int, leave_out_damaged: bool = False
+) -> Views:
     """Take the pictures (only `count` well chosen ones, if given), undistort them and bring them to height x width.
 
-    A picture is a file, or RGB [h, w, 3] in uint8, and is known by its camera's name.
+    A picture is a file, or RGB [h, w, 3] in uint8, and is known by its camera's name. Each that is needed is read once.
+    leave_out_damaged: do without pictures that cannot be read, and name them in `Views.left_out`.
 
     Raises InputError for fewer than two views, two cameras at the same pose, cameras without any baseline, a picture
     that cannot be read or has another size than its camera.
     """
-    if len(pairs) < FEWEST_VIEWS:
-        raise InputError(f"{len(pairs)} image with a camera, expected at least {FEWEST_VIEWS}; add images")
-    choice = ""
-    if count is not None and count != len(pairs):
-        pairs, choice = choose_pairs(pairs, count)
-    extrinsics = np.stack([camera.extrinsics for _, camera in pairs])  # [views, 4, 4]
-    _check_distinct(extrinsics, [camera.name for _, camera in pairs])
-    names = [_path(camera.name).name for _, camera in pairs]
-    images, intrinsics, cameras = zip(*(take(pair, height, width) for pair in pairs), strict=True)
-    return Views(names, np.stack(images), extrinsics, np.stack(intrinsics), list(cameras), choice)
+    loader = ViewLoader(pairs, height, width)
+    usable = list(range(len(pairs)))
+    left_out: list[str] = []
+    while True:
+        if len(usable) < FEWEST_VIEWS:
+            unread = f", {len(left_out)} cannot be read ({left_out[0]})" if left_out else ""
+            image = "1 image" if len(usable) == 1 else f"{len(usable)} images"
+            raise InputError(f"{image} with a camera, expected at least {FEWEST_VIEWS}{unread}; add images")
+        try:
+            return _prepared(loader, usable, count, left_out)
+        except DamagedImage as error:
+            damaged = {index for index in usable if isinstance(pairs[index][0], Path) and pairs[index][0] == error.path}
+            if not leave_out_damaged or not damaged:
+                raise
+            left_out.append(str(error))
+            usable = [index for index in usable if index not in damaged]
 
 
 def take(pair: Pair, height: int, width: int) -> tuple[np.ndarray, np.ndarray, Camera]:
@@ -103,22 +116,40 @@ def take(pair: Pair, height: int, width: int) -> tuple[np.ndarray, np.ndarray, C
 
     Raises InputError where it cannot be read or has another size than its camera.
     """
-    picture, camera = pair
-    image = picture if isinstance(picture, np.ndarray) else load_image(picture)
-    with located(camera.name):
-        camera = resized(camera, image.shape[1], image.shape[0])
-    image, camera = undistort(image, camera)
-    return *fit(image, camera.K, height, width), camera
+    loaded = load_view(pair, height, width)
+    return loaded.image, loaded.intrinsics, loaded.camera
 
 
-def choose_pairs(pairs: Sequence[Pair], count: int) -> tuple[list[Pair], str]:
-    """The `count` best of these pictures with cameras, and why, in words.
+def _prepared(loader: ViewLoader, usable: Sequence[int], count: int | None, left_out: Sequence[str]) -> Views:
+    """The views of these images, or of `count` of them."""
+    choice = ""
+    if count is not None and count < len(usable):
+        usable, choice = _choose(loader, usable, count)
+    cameras = [loader.pairs[index][1] for index in usable]
+    extrinsics = np.stack([camera.extrinsics for camera in cameras])  # [views, 4, 4]
+    _check_distinct(extrinsics, [camera.name for camera in cameras])
+    loaded = [loader.load(index) for index in usable]
+    samples = [view.sample for view in loaded if view.sample is not None]
+    return Views(
+        [_path(camera.name).name for camera in cameras],
+        np.stack([view.image for view in loaded]),
+        extrinsics,
+        np.stack([view.intrinsics for view in loaded]),
+        [view.camera for view in loaded],
+        choice,
+        samples=samples if len(samples) == len(loaded) else (),
+        left_out=left_out,
+    )
 
-    How far the scene is decides what is a good baseline: cameras may know, and otherwise a few pictures are matched.
-    Raises InputError as `choose_views` does, or where a picture cannot be read.
+
+def _choose(loader: ViewLoader, usable: Sequence[int], count: int) -> tuple[list[int], str]:
+    """The `count` best of these images with cameras, and why, in words.
+
+    How far the scene is decides what is a good baseline: cameras may know, and otherwise a few images are matched.
+    Raises InputError as `choose_views` does, or where an image cannot be read.
     """
-    cameras = [camera for _, camera in pairs]
-    distances, source = scene_distances(pairs)
+    cameras = [loader.pairs[index][1] for index in usable]
+    distances, source = scene_distances(cameras, lambda index: loader.sample(usable[index]))
     chosen = choose_views(cameras, count, distances)
     between = compare([cameras[index] for index in chosen], distances[chosen])
     i, j = np.array(neighbours(np.stack([cameras[index].extrinsics for index in chosen]))).T
@@ -129,7 +160,7 @@ def choose_pairs(pairs: Sequence[Pair], count: int) -> tuple[list[Pair], str]:
         f"neighbours share {share} of their view and stand {angles} degrees apart as seen from the scene, which is "
         f"{np.median(distances[chosen]):.3g} away by {source}"
     )
-    return [pairs[index] for index in chosen], choice
+    return [usable[index] for index in chosen], choice
 
 
 def check_views(images: Any, extrinsics: Any, intrinsics: Any, near: Any = None, far: Any = None) -> None:

@@ -8,6 +8,7 @@ from idesplat.runtime.cameras import read_cameras
 from idesplat.runtime.depth_range import find_depth_range, scene_distances
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.sparse_depth import range_of_depths
+from idesplat.runtime.view_loader import ViewLoader
 from idesplat.runtime.views import prepare
 
 TRAINED = (1.0, 100.0)
@@ -23,7 +24,9 @@ def room(scene):
 
 def ranged(pairs, **given):
     views = prepare(pairs, None, 96, 128)
-    return find_depth_range(views.images, views.extrinsics, views.intrinsics, views.cameras, TRAINED, **given)
+    return find_depth_range(
+        views.images, views.extrinsics, views.intrinsics, views.cameras, TRAINED, samples=views.samples, **given
+    )
 
 
 def test_matched_points_bound_the_true_depth(room):
@@ -68,7 +71,7 @@ def test_without_matches_the_baseline_decides(room):
 
 def test_the_scene_is_as_far_as_it_is(room):
     pairs, depth = room
-    distances, source = scene_distances(pairs)
+    distances, source = scene_distances([camera for _, camera in pairs], ViewLoader(pairs, 64, 96).sample)
     assert "points matched" in source
     assert 0.6 < distances[0] / np.median(depth) < 1.6
 

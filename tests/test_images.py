@@ -10,7 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from idesplat.runtime.cameras import Camera
 from idesplat.runtime.errors import InputError
-from idesplat.runtime.images import cover, find_images, fit, load_image, seen_by_lens, undistort
+from idesplat.runtime.images import (
+    cover,
+    describe_unread,
+    find_images,
+    fit,
+    load_image,
+    seen_by_lens,
+    undistort,
+    unread_images,
+)
 
 # rows of the upright picture, in RGB: red, green / blue, white / grey, black
 UPRIGHT = np.array(
@@ -64,14 +73,15 @@ def test_globs_and_files_each_once(tmp_path):
 
 
 def test_nothing_found_is_an_error(tmp_path):
-    touch(tmp_path, "empty/notes.txt", "photo.heic")
+    touch(tmp_path, "empty/notes.txt", "photo.dng", "raw/photo.dng")
     for given_, expected in (
         ([], "no images given"),
         ([tmp_path / "empty"], "empty: no images in this folder"),
         ([tmp_path / "absent.jpg"], "absent.jpg: no such file"),
         ([str(tmp_path / "*.gif")], "no such file or folder, nor a pattern"),
-        ([str(tmp_path / "*.heic")], "matches no images"),
-        ([tmp_path / "photo.heic"], "photo.heic: not an image by its suffix"),
+        ([str(tmp_path / "*.dng")], "matches no images, but 1 of formats that are not read"),
+        ([tmp_path / "raw"], "raw: no images in this folder, but 1 of formats that are not read"),
+        ([tmp_path / "photo.dng"], "photo.dng: not an image by its suffix"),
     ):
         with pytest.raises(InputError, match=expected):
             find_images(given_)
@@ -83,6 +93,22 @@ def test_any_names_can_be_sorted(tmp_path_factory, names):
     folder = tmp_path_factory.mktemp("names")
     touch(folder, *(f"x{name}.png" for name in names))
     assert {path.name for path in find_images([folder])} == {f"x{name}.png" for name in names}
+
+
+def test_a_file_is_found_once_under_any_path(tmp_path):
+    touch(tmp_path, "a/1.png", "b/2.png")
+    found = find_images([tmp_path / "a", tmp_path / "b" / ".." / "a" / "1.png", tmp_path / "b"])
+    assert [path.name for path in found] == ["1.png", "2.png"]
+
+
+def test_images_that_are_not_read_are_named(tmp_path):
+    touch(tmp_path, "1.jpg", "2.heic", "IMG_2.DNG", "IMG_1.cr2", "a.gif", "z.nef", "._x.dng", "notes.txt", "data.npz")
+    assert [path.name for path in find_images([tmp_path])] == ["1.jpg", "2.heic"]
+    assert [path.name for path in unread_images([tmp_path])] == ["a.gif", "IMG_1.cr2", "IMG_2.DNG", "z.nef"]
+    assert describe_unread([str(tmp_path / "I*")]) == [
+        "2 images are of a format that is not read, and left out: IMG_1.cr2, IMG_2.DNG; save as JPEG or PNG"
+    ]
+    assert describe_unread([tmp_path / "1.jpg"]) == []
 
 
 # ---- reading
@@ -126,14 +152,15 @@ def test_transparency_is_laid_on_white(tmp_path, dtype):
 
 
 @pytest.mark.skipif(not hasattr(cv2, "imencodeWithMetadata"), reason="OpenCV before 4.11 writes no metadata")
-def test_transparency_with_rotation_is_refused(tmp_path):
+def test_transparency_with_rotation_is_turned(tmp_path):
     tag = struct.pack(">2sHI", b"MM", 42, 8) + struct.pack(">HHHIHHI", 1, 0x0112, 3, 1, 6, 0, 0)
     rgba = np.concatenate([UPRIGHT, UPRIGHT[..., :1]], axis=-1)
     exif = [np.frombuffer(tag, np.uint8)]
     content = cv2.imencodeWithMetadata(".png", rgba, [cv2.IMAGE_METADATA_EXIF], exif)[1]
     (tmp_path / "a.png").write_bytes(content.tobytes())
-    with pytest.raises(InputError, match=r"a\.png: has transparency and an EXIF rotation"):
-        load_image(tmp_path / "a.png")
+    opacity = UPRIGHT[..., :1] / 255  # red was taken for it
+    expected = np.rot90(UPRIGHT[..., ::-1] * opacity + 255 * (1 - opacity), -1)
+    np.testing.assert_allclose(load_image(tmp_path / "a.png"), expected, atol=0.51)
 
 
 def test_what_cannot_be_read(tmp_path):
@@ -146,7 +173,7 @@ def test_what_cannot_be_read(tmp_path):
         ("float.tiff", "holds float32"),
         ("cut.png", "damaged"),
         ("text.jpg", "damaged"),
-        ("empty.jpg", "damaged"),
+        ("empty.jpg", "empty.jpg: is empty"),
         ("absent.jpg", "cannot be read"),
         (".", "cannot be read"),
     ):

@@ -67,3 +67,19 @@ def test_mistakes(clip, tmp_path):
         video.named_frames(clip, ["0001.jpg", "0002.jpg", "0007.jpg"], tmp_path)
     with pytest.raises(InputError, match=r"damaged|expected two at least"):
         video.sample_frames(tmp_path / "cut.avi", tmp_path)
+
+
+def test_frames_larger_than_the_limit_are_refused(tmp_path, monkeypatch):
+    writer = cv2.VideoWriter(str(tmp_path / "large.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 30, (1200, 900))
+    for _ in range(2):
+        writer.write(np.zeros((900, 1200, 3), np.uint8))
+    writer.release()
+    monkeypatch.setenv("IDESPLAT_MAX_MEGAPIXELS", "1")
+    with pytest.raises(InputError, match=r"large\.avi: has 1200 x 900 pixels, .*IDESPLAT_MAX_MEGAPIXELS"):
+        video.sample_frames(tmp_path / "large.avi", tmp_path)
+
+
+def test_names_of_cameras_are_no_numbers_of_any_length(clip, tmp_path):
+    names = ["clip-" + "9" * 5000, "9" * 5000, "²", "clip-000003", "clip-000005"]
+    files = video.named_frames(clip, names, tmp_path)
+    assert [file.name for file in files] == ["clip-000003.png", "clip-000005.png"]

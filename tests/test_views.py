@@ -1,5 +1,7 @@
 """Pictures matched with cameras, views chosen, arrays made and checked."""
 
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,9 +10,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from idesplat.runtime import view_choice
 from idesplat.runtime.cameras import Camera
 from idesplat.runtime.errors import InputError
-from idesplat.runtime.view_choice import choose_views, compare
+from idesplat.runtime.view_choice import Scorer, choose_views, compare, guess_distances
 from idesplat.runtime.views import check_views, match, prepare
 
 K = np.array([[70.0, 0, 42], [0, 72, 29], [0, 0, 1]])
@@ -164,6 +167,108 @@ def test_choose_gives_distinct_rising_indices_or_an_input_error(values, count):
     except InputError:
         return
     assert len(chosen) == count and chosen == sorted(set(chosen)) and chosen[0] >= 0 and chosen[-1] < len(values)
+
+
+def every_pair_scored(cameras, distances):
+    """The cost of each two cameras, [cameras, cameras], by the definition: 6 x 6 points at the scene's distance."""
+    steps = (np.arange(6) + 0.5) / 6
+    total = len(cameras)
+    overlap, parallax = np.eye(total), np.zeros((total, total))
+    for i, first in enumerate(cameras):
+        x, y = (side.ravel() for side in np.meshgrid(steps * first.width, steps * first.height))
+        rays = np.stack([(x - first.K[0, 2]) / first.K[0, 0], (y - first.K[1, 2]) / first.K[1, 1], np.ones(36)], axis=1)
+        points = distances[i] * rays @ first.extrinsics[:3, :3].T + first.extrinsics[:3, 3]
+        for j, second in enumerate(cameras):
+            local = (np.c_[points, np.ones(36)] @ np.linalg.inv(second.extrinsics).T)[:, :3]
+            u, v, w = (local @ second.K.T).T
+            inside = (w > 0) & (u >= 0) & (v >= 0) & (u <= second.width * w) & (v <= second.height * w)
+            sights = [points - camera.extrinsics[:3, 3] for camera in (first, second)]
+            a, b = (sight / np.linalg.norm(sight, axis=1, keepdims=True) for sight in sights)
+            angles = np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(axis=1)))
+            overlap[i, j], parallax[i, j] = inside.mean(), angles[inside].mean() if inside.any() else 0
+    both = (overlap > 0) & (overlap.T > 0)
+    with np.errstate(divide="ignore"):
+        cost = np.abs(np.log2((parallax + parallax.T) / 2 * both / 5))
+    return np.round(cost - 2 * np.log2(np.maximum(np.minimum(overlap, overlap.T), 1e-3)), 6)
+
+
+def captures(count, seed=0):
+    """Cameras around an object, on a dome, in a grid from the air, walking ahead, anywhere, [cameras, 4, 4] each."""
+    rng = np.random.default_rng(seed)
+
+    def look(position, target):
+        forward = (target - position) / np.linalg.norm(target - position)
+        right = np.cross([0.0, 1, 0], forward)
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+        pose[:3, 3] = position
+        return pose
+
+    dome = rng.normal(size=(count, 3))
+    dome *= 5 / np.linalg.norm(dome, axis=1, keepdims=True)
+    side = int(np.sqrt(count))
+    grid = np.stack([np.eye(4)] * side**2)
+    grid[:, :2, 3] = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2) * 8.0
+    ahead = np.stack([np.eye(4)] * count)
+    ahead[:, 2, 3], ahead[:, :2, 3] = np.arange(count) * 0.05, rng.normal(size=(count, 2)) * 0.01
+    anywhere = rng.uniform(-3, 3, (count, 2, 3))
+    return {
+        "orbit": orbit(np.linspace(0, 360, count, endpoint=False)),
+        "dome": np.stack([look(position, np.zeros(3)) for position in dome]),
+        "grid": grid,
+        "ahead": ahead,
+        "anywhere": np.stack([look(position, target) for position, target in anywhere]),
+    }
+
+
+@pytest.mark.parametrize("name", captures(9))
+def test_choosing_goes_by_the_best_of_all_pairs(name):
+    cameras = at(captures(36)[name])
+    distances = guess_distances(cameras)
+    cost = every_pair_scored(cameras, distances)
+    centres = np.stack([camera.extrinsics[:3, 3] for camera in cameras])
+    chosen = list(np.unravel_index(cost.argmin(), cost.shape))
+    while len(chosen) < 4:
+        rest = [index for index in range(len(cameras)) if index not in chosen]
+        nearest = [chosen[int(np.linalg.norm(centres[chosen] - centres[index], axis=1).argmin())] for index in rest]
+        chosen.append(rest[int(cost[rest, nearest].argmin())])
+    assert choose_views(cameras, 4) == sorted(chosen)
+    assert choose_views(cameras, 2) == sorted(chosen[:2])
+
+
+@pytest.mark.parametrize("name", captures(9))
+def test_large_captures_give_nearly_the_best_pair(name, monkeypatch):
+    """Where not every pair is scored, the best that is found is nearly as good as the best there is."""
+    cameras = at(captures(200, seed=1)[name])
+    scorer = Scorer(cameras, guess_distances(cameras))
+    best = scorer.score(*np.triu_indices(len(cameras), 1)).cost.min()
+    monkeypatch.setattr(view_choice, "EXHAUSTIVE", 40)
+    first, second = choose_views(cameras, 2)
+    found = scorer.score(np.array([first]), np.array([second])).cost[0]
+    assert found <= best + 0.15  # a fifth of a parallax twice too large would be 0.26
+    assert len(set(choose_views(cameras, 6))) == 6
+
+
+def test_ten_thousand_cameras_take_little_memory():
+    code = """
+import resource, sys
+import numpy as np
+sys.path.insert(0, sys.argv[1])
+from test_views import at, captures
+from idesplat.runtime.view_choice import choose_views
+cameras = at(captures(10_000)["orbit"])
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+assert len(choose_views(cameras, 3)) == 3
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+"""
+    pytest.importorskip("resource")
+    done = subprocess.run(
+        [sys.executable, "-c", code, Path(__file__).parent], capture_output=True, text=True, check=True
+    )
+    assert int(done.stdout) < 400 * (
+        1024 if sys.platform != "darwin" else 1024**2
+    )  # one square of numbers takes 800 MB
 
 
 # ---- preparing

@@ -20,6 +20,7 @@ import typer
 
 from ..runtime.errors import InputError, exit_on_input_error
 from ..runtime.input_files import model_files
+from ..runtime.limits import whole_number
 from ..runtime.outputs import STANDARD_OUTPUT, Overwrite, guards_outputs, outputs
 from ..runtime.sizes import parse_size
 from ..runtime.terminal import run, say, warn
@@ -254,7 +255,7 @@ def _settings(threads: int | None, repeats: int, eager: bool) -> Settings:
 def _counts(text: str) -> list[int]:
     """The option --views, `2,4`, as numbers; raises InputError."""
     parts = text.split(",")
-    if not all(part.isdigit() and int(part) >= FEWEST_VIEWS for part in parts):
+    if not all((whole_number(part) or 0) >= FEWEST_VIEWS for part in parts):
         raise InputError(f"--views {text}: expected numbers from {FEWEST_VIEWS}, such as 2,4")
     return [int(part) for part in parts]
 

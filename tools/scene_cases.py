@@ -11,6 +11,7 @@ from ..runtime.cameras import Camera, resized
 from ..runtime.depth_range import DepthRange
 from ..runtime.errors import InputError
 from ..runtime.files import check_regular
+from ..runtime.image_header import image_size
 from ..runtime.images import cover, load_image, seen_by_lens
 from ..runtime.views import Views, prepare
 from .cases import Case, Posed
@@ -98,7 +99,8 @@ def load_case(
 
     def taken(part: slice) -> Views:
         images, extrinsics, intrinsics = (field[part] for field in (views.images, views.extrinsics, views.intrinsics))
-        return Views(views.names[part], images, extrinsics, intrinsics, views.cameras[part])
+        samples = views.samples[part]
+        return Views(views.names[part], images, extrinsics, intrinsics, views.cameras[part], samples=samples)
 
     def posed(part: Views, valid: np.ndarray) -> Posed:
         return Posed(part.names, part.images, part.extrinsics, part.intrinsics, valid)
@@ -156,7 +158,7 @@ def _fitted_depth(folder: Path, path: Path, camera: Camera, height: int, width: 
         raise
     except (OSError, ValueError, KeyError) as error:
         raise InputError(f"{file}: no readable depth ({error}); expected what make_scene writes") from None
-    shape = load_image(path).shape[:2]
+    shape = image_size(path)[::-1]
     if depth.shape != shape:
         raise InputError(f"{file}: depth of shape {depth.shape}, expected {shape}, the size of {path.name}")
     crop = cover(shape[1], shape[0], width, height)
