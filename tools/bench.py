@@ -21,7 +21,7 @@ import typer
 from ..runtime.errors import InputError, exit_on_input_error
 from ..runtime.files import check_writable
 from ..runtime.sizes import parse_size
-from ..runtime.terminal import run, say, warn
+from ..runtime.terminal import literal, run, say, warn
 
 if TYPE_CHECKING:  # nothing heavy is loaded before there is something to measure
     from .bench_report import Row
@@ -324,7 +324,7 @@ def _saying() -> Iterator[Say]:
     from rich.console import Console
 
     with Console(stderr=True).status("starting") as status:
-        yield status.update
+        yield lambda doing: status.update(literal(doing))
 
 
 def _machine(settings: Settings) -> dict[str, Any]:
