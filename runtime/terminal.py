@@ -63,6 +63,13 @@ def say(*lines: str) -> None:
         raise InputError(_unwritable(error)) from None
 
 
+def literal(text: str) -> str:
+    """Text for a rich table or status that shows a name as it is: brackets are no markup, nor is anything obeyed."""
+    from rich.markup import escape
+
+    return escape(printable(text))
+
+
 def warn(text: str) -> None:
     """Print one line on stderr, with control characters that names hold as escapes."""
     print(printable(text), file=sys.stderr)

@@ -17,6 +17,8 @@ from idesplat.runtime.default_model import default_model
 from idesplat.runtime.files import replacing, scratch_folder
 from idesplat.runtime.gaussians import with_colours
 from idesplat.runtime.ply import write_ply
+from idesplat.tools.novel_views import Result, Target
+from idesplat.tools.report import print_views
 
 COLUMNS = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2")
 COLUMNS += ("rot_0", "rot_1", "rot_2", "rot_3")
@@ -316,6 +318,13 @@ def test_control_characters_are_not_printed(tmp_path, there):
     assert b"\\x1b[2J" in printed and b"\\u202e" in printed
     assert not re.search(rb"[\x00-\x09\x0b-\x1f\x7f\x9b\xff]|\xe2\x80\xae", printed.replace(b"\xc2\x9b", b"\x9b"))
     assert printed.count(b"\n") == 1
+
+
+def test_names_in_tables_are_no_markup(capsys):
+    result = Result("room", ["[/].png"], 1, 2, [Target("[red]\x1b[2J.png", {"model": {"psnr": 20.0}}, {})], {})
+    print_views([result])
+    printed = capsys.readouterr().out
+    assert "[red]\\x1b[2J.png" in printed and "[/].png" in printed
 
 
 def test_wrong_arguments_are_one_line():

@@ -23,7 +23,7 @@ from ..runtime.input_files import model_files
 from ..runtime.limits import whole_number
 from ..runtime.outputs import STANDARD_OUTPUT, Overwrite, guards_outputs, outputs
 from ..runtime.sizes import parse_size
-from ..runtime.terminal import run, say, warn
+from ..runtime.terminal import literal, run, say, warn
 
 if TYPE_CHECKING:  # nothing heavy is loaded before there is something to measure
     from .bench_report import Row
@@ -339,7 +339,7 @@ def _saying() -> Iterator[Say]:
     from rich.console import Console
 
     with Console(stderr=True).status("starting") as status:
-        yield status.update
+        yield lambda doing: status.update(literal(doing))
 
 
 def _machine(settings: Settings) -> dict[str, Any]:

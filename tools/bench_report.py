@@ -13,6 +13,7 @@ from rich.table import Table
 from ..runtime.errors import InputError
 from ..runtime.files import read_bytes
 from ..runtime.outputs import write_json
+from ..runtime.terminal import literal
 
 WIDTH = 150  # columns, where there is no terminal to ask
 SHOWN = 7  # operators of a row
@@ -82,7 +83,7 @@ def print_rows(rows: Sequence[Row]) -> None:
     for name in ("seconds", "spread", "/ eager", "/ floor", "GFLOP", "peak GB", "opened in", "depth off"):
         table.add_column(name, justify="right")
     for row in rows:
-        names = (row.model, row.precision, row.provider, str(row.views), f"{row.height}x{row.width}")
+        names = (literal(row.model), row.precision, row.provider, str(row.views), f"{row.height}x{row.width}")
         table.add_row(*names, *_numbers(row))
     _print(table)
     shares = Table()
@@ -91,7 +92,7 @@ def print_rows(rows: Sequence[Row]) -> None:
     for row in rows:
         if row.operators:
             size = f"{row.height}x{row.width}"
-            shares.add_row(row.model, str(row.views), size, _shares(row.operators), _shares(row.stages))
+            shares.add_row(literal(row.model), str(row.views), size, _shares(row.operators), _shares(row.stages))
     if shares.rows:
         _print(shares)
 
@@ -131,7 +132,7 @@ def compare(rows: Sequence[Row], before: Sequence[Row]) -> list[str]:
         verdicts = _verdicts(row, old)
         time = float(np.median(row.effort) / np.median(old.effort))
         memory = f"{row.peak_bytes / old.peak_bytes:.2f}" if row.peak_bytes and old.peak_bytes else ""
-        table.add_row(row.name, f"{time:.2f}", memory, ", ".join(verdicts))
+        table.add_row(literal(row.name), f"{time:.2f}", memory, ", ".join(verdicts))
         worse += [f"{row.name}: {verdict}" for verdict in verdicts]
     _print(table)
     return worse

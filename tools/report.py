@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ..runtime.files import replacing
-from ..runtime.terminal import say
+from ..runtime.terminal import literal, say
 from .novel_views import MODEL, Result, Scores
 
 RESULTS = "results.json"
@@ -40,7 +40,7 @@ def print_views(results: Sequence[Result]) -> None:
     for result in results:
         for target in result.targets:
             cells = [_number(measure, target.scores[method][measure]) for measure, method in columns]
-            table.add_row(target.name, ", ".join(result.context), *cells)
+            table.add_row(literal(target.name), literal(", ".join(result.context)), *cells)
     _print(table)
 
 
