@@ -52,6 +52,7 @@ class Outputs:
         self._folders: dict[object, str] = {}  # folders that hold outputs, and theirs: the option
         self._checked: set[Path] = set()  # folders that are known to hold outputs
         self._records: dict[Path, dict[str, WrittenFile]] = {}
+        self._real_folders: dict[Path, str] = {}
         self._made: list[Path] = []
         self._contexts = ExitStack()
 
@@ -76,7 +77,7 @@ class Outputs:
         """
         for path in paths:
             path = Path(path)
-            for key in _identities(path):
+            for key in self._identities(path):
                 if key in self._outputs:
                     self._refuse_input(*self._outputs[key], path, what)
                 self._inputs.setdefault(key, (path, what))
@@ -91,7 +92,7 @@ class Outputs:
         for path in paths:
             path = Path(path)
             existing = _existing(option, path)
-            keys = _identities(path)
+            keys = self._identities(path)
             for key in keys:
                 if key in self._inputs:
                     self._refuse_input(path, option, *self._inputs[key])
@@ -123,7 +124,7 @@ class Outputs:
 
     def check(self, path: Path) -> None:
         """Check a file that is about to be written, unless it was announced, and make its folder."""
-        if _comparable(path) not in self._outputs:
+        if self._comparable(path) not in self._outputs:
             self.writes("", [path])
         self.make_folder(Path(path).parent)
 
@@ -143,7 +144,7 @@ class Outputs:
 
     def _add(self, option: str, path: Path, keys: Sequence[object]) -> None:
         """Take up an output that is no input; raises InputError if it is another output, or in the place of one."""
-        comparable = _comparable(path)
+        comparable = self._comparable(path)
         for key in (comparable, *keys):
             if key in self._outputs:
                 raise InputError(f"{_named(option)}{path}: is also the file of {self._outputs[key][1]}; choose another")
@@ -158,13 +159,34 @@ class Outputs:
         if folder in self._checked:
             return
         for place in (folder, *folder.parents):
-            key = _comparable(place)
+            key = self._comparable(place)
             if key in self._outputs:
                 other = self._outputs[key][1]
                 raise InputError(f"{_named(option)}{folder}: {place} is the file of {other}; choose another")
             self._folders.setdefault(key, option or str(folder))
         check_can_create(folder)
         self._checked.add(folder)
+
+    def _comparable(self, path: Path) -> object:
+        """The key under which two outputs are the same, on whatever file system."""
+        return "output", _without_case(self._real(path))
+
+    def _identities(self, path: Path) -> list[object]:
+        """The keys under which a path is known: where it leads, and, if there is a file, which one that is."""
+        keys: list[object] = [self._real(path)]
+        with _refusing_bad_names(path), suppress(OSError):
+            status = os.stat(path)
+            keys.append((status.st_dev, status.st_ino))
+        return keys
+
+    def _real(self, path: Path) -> str:
+        """The path without links and dots; of many files in one folder, that is looked up once."""
+        with _refusing_bad_names(path):
+            if path.name in ("", "..") or os.path.islink(path):
+                return os.path.realpath(path)
+            if path.parent not in self._real_folders:
+                self._real_folders[path.parent] = os.path.realpath(path.parent)
+            return os.path.join(self._real_folders[path.parent], path.name)
 
     def _refuse_input(self, path: Path, option: str, source: Path, what: str) -> None:
         raise InputError(f"{_named(option)}{path}: would replace {what}, {source}; choose another name")
@@ -250,22 +272,6 @@ def _distinct(names: Sequence[str], endings: Sequence[str]) -> bool:
 def _without_case(text: str) -> str:
     """The same for names that a file system may take for one: Windows and macOS ignore case, macOS how é is encoded."""
     return unicodedata.normalize("NFC", text).casefold()
-
-
-def _comparable(path: Path) -> object:
-    """The key under which two outputs are the same, on whatever file system."""
-    with _refusing_bad_names(path):
-        return "output", _without_case(os.path.realpath(path))
-
-
-def _identities(path: Path) -> list[object]:
-    """The keys under which a path is known: where it leads, and, if there is a file, which one that is."""
-    with _refusing_bad_names(path):
-        keys: list[object] = [os.path.realpath(path)]
-        with suppress(OSError):
-            status = os.stat(path)
-            keys.append((status.st_dev, status.st_ino))
-    return keys
 
 
 def _existing(option: str, path: Path) -> bool:

@@ -178,6 +178,24 @@ def test_frames_by_range(frames, numbers):
     assert pick_frames(images, frames) == [images[number] for number in numbers]
 
 
+def test_images_of_the_same_name_are_told_apart(workplace):
+    def in_folders(content):
+        content["frames"] = content["frames"][:2]
+        for frame, folder in zip(content["frames"], ("left", "right"), strict=True):
+            Path(folder).mkdir()
+            frame["file_path"] = Path(frame["file_path"]).rename(f"{folder}/000.png").as_posix()
+
+    change_cameras(in_folders)()
+    folders = ("--save-depth", "new/depth", "--render", "new/views")
+    given = ("--images", "left", "right", "--near", "1", "--far", "20")
+    assert run_command(main, *USUAL[2:], *given, *folders) == 0
+    names = ("left-000", "right-000")
+    assert {path.name for path in Path("new/depth").iterdir()} == {
+        name + end for name in names for end in (".png", ".npz")
+    }
+    assert {path.name for path in Path("new/views").glob("view-*")} == {f"view-{name}.png" for name in names}
+
+
 def test_the_summary_on_standard_output(workplace, capsys):
     assert run_command(main, *USUAL, "--json", "-", "--save-depth", "new/depth", "--timings") == 0
     printed = capsys.readouterr()
