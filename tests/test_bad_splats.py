@@ -284,7 +284,7 @@ def test_a_directory_that_lies_of_sizes_does_not_fill_memory(tmp_path: Path, wri
     path = tmp_path / "lie.sog"
     path.write_bytes(content)
     tracemalloc.start()
-    with pytest.raises(InputError, match="lie.sog"):
+    with pytest.raises(InputError, match=r"lie\.sog"):
         read_scene(path)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
