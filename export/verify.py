@@ -166,7 +166,7 @@ def _figures(name: str, found: np.ndarray, expected: np.ndarray, views: int) -> 
 
 
 def _by_channel(values: np.ndarray, views: int) -> np.ndarray:
-    """Maps [views, channels, h, w], depth [views, h, w], Gaussians [views * pixels, ...] to [views, channels, places]."""
+    """Maps [views, channels, h, w], depth [views, h, w], Gaussians [views * pixels, ...] by view, channel and place."""
     if len(values) != views:
         return np.moveaxis(values.reshape(views, len(values) // views, -1), 1, 2)
     channels = values.shape[1] if values.ndim == 4 else 1
