@@ -1,7 +1,8 @@
 """The command idesplat-export: a checkpoint to ONNX, verified."""
 
 import sys
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
@@ -50,9 +51,9 @@ def export(
 
     Views, height and width stay dynamic unless fixed by --views and --size.
     """
-    if staged is not None:
-        staged = _resolve(staged)
-    _check_targets(checkpoint, out, staged)
+    with _naming_what_fails("choose another name"):
+        staged = staged.resolve() if staged is not None and staged.is_symlink() else staged
+        _check_targets(checkpoint, out, staged)
     if find_spec("torch") is None or find_spec("onnx") is None:
         raise InputError("exporting needs PyTorch and onnx, which are not installed; pip install 'idesplat[export]'")
     from ..model.checkpoint import CheckpointError
@@ -61,14 +62,17 @@ def export(
 
     if precision not in PRECISIONS:
         raise InputError(f"--precision {precision}: unknown; choose one of {', '.join(PRECISIONS)}")
-    _check_existing(out, staged, overwrite)
+    with _naming_what_fails("choose another name"):
+        _check_existing(out, staged, overwrite)
     try:
         model, name, digest = _load(checkpoint, preset)
     except CheckpointError as error:
         raise InputError(str(error)) from None
     fixed = Fixed(views, _fitting_size(size, views, model.config.size_multiple) if size else None)
     description = describe(model, name, checkpoint.name, digest, fixed, precision)
-    if not _export(model, description, fixed, out, staged, verbose):
+    with _naming_what_fails("choose a folder on a disk with room for it"):
+        passed = _export(model, description, fixed, out, staged, verbose)
+    if not passed:
         print("error: the graph departs from the network (see the table); nothing was written", file=sys.stderr)
         raise SystemExit(MISMATCH)
 
@@ -78,12 +82,15 @@ def main() -> None:
     typer.run(export)
 
 
-def _resolve(folder: Path) -> Path:
-    """The folder itself where a link leads to it; raises InputError where links lead in a circle."""
+@contextmanager
+def _naming_what_fails(remedy: str) -> Iterator[None]:
+    """Raise InputError for what the system says of a path: a name that is too long, links in a circle, a full disk."""
     try:
-        return folder.resolve() if folder.is_symlink() else folder
+        yield
     except (OSError, RuntimeError) as error:
-        raise InputError(f"--staged {folder}: cannot be followed ({error}); choose another folder") from None
+        if isinstance(error, RuntimeError) and "Symlink loop" not in str(error):
+            raise
+        raise InputError(f"cannot write the result ({error}); {remedy}") from None
 
 
 def _check_targets(checkpoint: Path, out: Path | None, staged: Path | None) -> None:

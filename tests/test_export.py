@@ -1,5 +1,6 @@
 """The exported files: standard, self-describing, dynamic, and equal to the network."""
 
+import errno
 import json
 import os
 import shutil
@@ -153,13 +154,15 @@ ERRORS = {
     "bad size": (["weights.pth", "out.onnx", "--size", "64"], "HEIGHTxWIDTH"),
     "size not a multiple": (["weights.pth", "out.onnx", "--size", "64x70"], "multiples of 16"),
     "staged is a file": (["weights.pth", "--staged", "text.pth"], "is a file"),
-    "staged holds other files": (["weights.pth", "--staged", "."], "holds foreign.onnx, which"),
+    "staged holds other files": (["weights.pth", "--staged", "."], "holds app, which"),
     "staged is a data folder": (["weights.pth", "--staged", "app"], "holds index.html, which"),
     "out is not ours": (["weights.pth", "foreign.onnx"], "idesplat-export did not write it"),
     "out is a folder": (["weights.pth", "folder.onnx"], "not a regular file"),
     "out is the checkpoint": (["weights.onnx", "./weights.onnx"], "is the checkpoint"),
     "out is in the staged folder": (["weights.pth", "new/a.onnx", "--staged", "new"], "outside it"),
     "too many pixels": (["weights.pth", "out.onnx", "--size", "65536x65536"], "more than 16,777,216 pixels"),
+    "a name too long": (["weights.pth", f"{'a' * 300}.onnx"], "File name too long"),
+    "links in a circle": (["weights.pth", "--staged", "circle"], "choose another name"),
     "a pipe": (["pipe.pth", "out.onnx"], "not a regular file"),
 }
 
@@ -172,6 +175,7 @@ def test_errors_are_one_line(name, small_checkpoint, presets, tmp_path, monkeypa
     (tmp_path / "text.pth").write_text("hello")
     (tmp_path / "foreign.onnx").write_text("not ours")
     os.mkfifo(tmp_path / "pipe.pth")
+    (tmp_path / "circle").symlink_to(tmp_path / "circle")
     for folder in ("folder.onnx", "app", "new"):
         (tmp_path / folder).mkdir()
     (tmp_path / "app" / "manifest.json").write_text('{"name": "app"}')
@@ -189,6 +193,17 @@ def test_errors_are_one_line(name, small_checkpoint, presets, tmp_path, monkeypa
 def test_more_views_than_can_be_traced_are_refused(small_checkpoint, tmp_path, capsys):
     assert run_command(cli.main, small_checkpoint, tmp_path / "out.onnx", "--views", 65) == 2
     assert "2<=x<=64" in capsys.readouterr().err
+
+
+def test_a_full_disk_is_named_and_leaves_nothing(small_checkpoint, presets, tmp_path, monkeypatch, capsys):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("idesplat.export.exporter.freeze", full)
+    assert run_command(cli.main, small_checkpoint, tmp_path / "out.onnx", "--staged", tmp_path / "staged") == 2
+    message = capsys.readouterr().err.splitlines()[-1]
+    assert message.startswith("error: ") and "No space left on device" in message
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_metadata_of_another_layout_is_refused(tmp_path):
