@@ -20,7 +20,9 @@ from .stages import NamedTensors, example_inputs
 # Where views are not fixed; more than `ORDERED_VIEWS` of model/geometry.py, and more than a view has neighbours.
 MOST_VIEWS_OF_A_CASE = 5
 # By how much the views' focal lengths, principal points and depth ranges differ.
-FOCAL_SPREAD, CENTRE_SPREAD, RANGE_SPREAD = 0.15, 0.04, 0.3
+FOCAL_SPREAD, CENTRE_SPREAD, NEAR_SPREAD = 0.15, 0.04, 0.3
+# Far over near, from the first view to the last: so little that the far end counts in inverse depths.
+LEAST_RANGE, LARGEST_RANGE = 3.0, 6.0
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,7 @@ def verification_cases(network: NamedTensors, description: Description, fixed: F
     yield _case(network, "room", room)
     noise = example_inputs(fixed.views or MOST_VIEWS_OF_A_CASE, *across, near, far)
     yield _case(network, "noise", different_cameras(noise))
-    small_room = room_inputs(fixed.views or 3, *upright, 0.8 * near, 0.5 * far)
+    small_room = room_inputs(fixed.views or 3, *upright, 0.8 * near, far)
     yield _case(network, "room", different_cameras(small_room))
 
 
@@ -54,8 +56,9 @@ def different_cameras(inputs: dict[str, Tensor]) -> dict[str, Tensor]:
     intrinsics[:, 1, 1] *= 1 + FOCAL_SPREAD * spread.flip(0)
     intrinsics[:, 0, 2] += CENTRE_SPREAD * spread
     intrinsics[:, 1, 2] -= CENTRE_SPREAD * spread
-    factor = 1 + RANGE_SPREAD * torch.linspace(0, 1, views)
-    return inputs | {"intrinsics": intrinsics, "near": inputs["near"] * factor, "far": inputs["far"] / factor}
+    near = inputs["near"] * (1 + NEAR_SPREAD * torch.linspace(0, 1, views))
+    far = near * torch.linspace(LEAST_RANGE, LARGEST_RANGE, views)
+    return inputs | {"intrinsics": intrinsics, "near": near, "far": far}
 
 
 def _case(network: NamedTensors, content: str, inputs: dict[str, Tensor]) -> Case:
