@@ -1,8 +1,7 @@
 """The command idesplat-export: a checkpoint to ONNX, verified."""
 
-import shutil
-import sys
-import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
@@ -10,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ..runtime.bundle import MANIFEST_NAME, Description, StageFile, write_manifest
+from ..runtime.bundle import Description, StageFile, write_manifest
 from ..runtime.errors import InputError, exit_on_input_error
+from ..runtime.files import check_writable, make_folder
 from ..runtime.outputs import Overwrite, guards_outputs, outputs
 from ..runtime.sizes import parse_size, size_fits, size_rule
 from ..runtime.terminal import run, say, warn
@@ -19,9 +19,13 @@ from ..runtime.terminal import run, say, warn
 if TYPE_CHECKING:
     from ..model.networks import Network
     from .exporter import Fixed, Graphs
-    from .verify import Parity
+    from .stages import Stage
 
-PARITY_BREACH = 1
+MISMATCH = 1
+# More views, or pixels in all of them, are not baked in: tracing runs the network in PyTorch once, and IDESplat takes
+# some 6 kB a pixel for it.
+MOST_VIEWS = 64
+MOST_PIXELS = 1 << 24
 
 
 @exit_on_input_error
@@ -35,19 +39,22 @@ def export(
         str | None, typer.Option(help="What the file was trained as, where its name does not say.")
     ] = None,
     staged: Annotated[Path | None, typer.Option(help="Folder for one graph a stage, with a manifest.")] = None,
-    views: Annotated[int | None, typer.Option(help="Bake in the number of views.", min=2)] = None,
+    views: Annotated[int | None, typer.Option(help="Bake in the number of views.", min=2, max=MOST_VIEWS)] = None,
     size: Annotated[str | None, typer.Option(help="Bake in the image size, such as 256x256.")] = None,
     precision: Annotated[
         str, typer.Option(help="float32, int8 (for processors) or fp16 (for graphics cards).")
     ] = "float32",
     overwrite: Overwrite = False,
+    verbose: Annotated[bool, typer.Option("--verbose", help="Print the error of every tensor in every case.")] = False,
 ) -> None:
     """Write a checkpoint as a standard ONNX graph (opset 20), and prove that it computes the same.
 
     Views, height and width stay dynamic unless fixed by --views and --size.
     """
-    outputs().reads("the checkpoint", [checkpoint])
-    folder = _check_targets(out, staged)
+    with _naming_what_fails("choose another name"):
+        staged = staged.resolve() if staged is not None and staged.is_symlink() else staged
+        outputs().reads("the checkpoint", [checkpoint])
+        _check_targets(out, staged)
     if find_spec("torch") is None or find_spec("onnx") is None:
         raise InputError("exporting needs PyTorch and onnx, which are not installed; pip install 'idesplat[export]'")
     from ..model.checkpoint import CheckpointError
@@ -56,15 +63,19 @@ def export(
 
     if precision not in PRECISIONS:
         raise InputError(f"--precision {precision}: unknown; choose one of {', '.join(PRECISIONS)}")
+    with _naming_what_fails("choose another name"):
+        _check_existing(out, staged)
     try:
         model, name, digest = _load(checkpoint, preset)
     except CheckpointError as error:
         raise InputError(str(error)) from None
-    fixed = Fixed(views, _fitting_size(size, model.config.size_multiple) if size else None)
+    fixed = Fixed(views, _fitting_size(size, views, model.config.size_multiple) if size else None)
     description = describe(model, name, checkpoint.name, digest, fixed, precision)
-    if not _export(model, description, fixed, folder, out, staged):
+    with _naming_what_fails("choose a folder on a disk with room for it"):
+        passed = _export(model, description, fixed, out, staged, verbose)
+    if not passed:
         warn("error: the graph departs from the network (see the table); nothing was written")
-        raise SystemExit(PARITY_BREACH)
+        raise SystemExit(MISMATCH)
 
 
 def main() -> None:
@@ -72,31 +83,58 @@ def main() -> None:
     run(export)
 
 
-def _check_targets(out: Path | None, staged: Path | None) -> Path:
-    """Find out before minutes of work whether the results can be written; the folder of the first of them."""
-    folders = [path.parent for path in (out, staged) if path is not None]
-    if not folders:
+@contextmanager
+def _naming_what_fails(remedy: str) -> Iterator[None]:
+    """Raise InputError for what the system says of a path: a name that is too long, links in a circle, a full disk."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "Symlink loop" not in str(error):
+            raise
+        raise InputError(f"cannot write the result ({error}); {remedy}") from None
+
+
+def _check_targets(out: Path | None, staged: Path | None) -> None:
+    """Find out before minutes of work whether the results can be written."""
+    if out is None and staged is None:
         raise InputError("nothing to write: give OUT.onnx, or --staged DIR, or both")
     if out is not None:
         if out.suffix != ".onnx":
             raise InputError(f"{out}: the output must end in .onnx")
-        outputs().writes("", [out])
         outputs().make_folder(out.parent)
+        check_writable(out.parent)
     if staged is not None:
         if staged.exists() and not staged.is_dir():
             raise InputError(f"--staged {staged}: is a file, expected a folder")
-        if staged.is_dir() and any(staged.iterdir()) and not (staged / MANIFEST_NAME).is_file():
-            raise InputError(f"--staged {staged}: holds other files; choose an empty or new folder")
+        if out is not None and staged.resolve() in (out.resolve(), *out.resolve().parents):
+            raise InputError(f"--staged {staged}: is replaced as a whole; choose a place outside it for {out}")
         outputs().writes_into("--staged", staged)
         outputs().make_folder(staged.parent)
-    return folders[0]
+        check_writable(staged.parent)
 
 
-def _fitting_size(text: str, multiple: int) -> tuple[int, int]:
+def _check_existing(out: Path | None, staged: Path | None) -> None:
+    """Raise InputError if the results would replace anything that idesplat-export did not write."""
+    from .written import check_replaceable, is_our_graph
+
+    if out is not None:
+        outputs().writes("", [out], known=is_our_graph(out))
+    if staged is not None and staged.is_dir():
+        check_replaceable(staged)
+
+
+def _fitting_size(text: str, views: int | None, multiple: int) -> tuple[int, int]:
     """`HEIGHTxWIDTH`, multiples of what the network needs."""
     height, width = parse_size(text)
     if not size_fits(height, width, multiple):
         raise InputError(f"--size {text}: {size_rule(multiple)}")
+    from .cases import MOST_VIEWS_OF_A_CASE
+
+    count = views or MOST_VIEWS_OF_A_CASE
+    if count * height * width > MOST_PIXELS:
+        raise InputError(
+            f"--size {text}: {count} views of it have more than {MOST_PIXELS:,} pixels; choose a smaller one"
+        )
     return height, width
 
 
@@ -151,58 +189,62 @@ def describe(
 
 
 def _export(
-    model: "Network", description: Description, fixed: "Fixed", folder: Path, out: Path | None, staged: Path | None
+    model: "Network", description: Description, fixed: "Fixed", out: Path | None, staged: Path | None, verbose: bool
 ) -> bool:
     """Trace, verify and write; False and nothing written if the graph departs from the network.
 
-    The work is done in a folder beside the results: a system's own for temporary files may lie in memory.
+    The work is done in folders beside the results, from where these are only moved: a system's own folder for
+    temporary files may lie in memory.
     """
     from rich.console import Console
 
     from .exporter import OPSET, freeze
+    from .report import print_details, print_summary
     from .stages import NamedTensors
-    from .verify import verify
-    from .weights import hand_out
+    from .verify import Exported, verify
+    from .weights import hand_out, publish
+    from .written import replace_folder, working_folder
 
     console = Console(stderr=True)
     network = NamedTensors(model)
-    with tempfile.TemporaryDirectory(prefix=".idesplat-export.", dir=folder) as working:
+    with ExitStack() as stack:
+        parents = dict.fromkeys(path.parent for path in (out, staged) if path is not None)
+        folders = {parent: stack.enter_context(working_folder(parent)) for parent in parents}
+        working = next(iter(folders.values()))
         with console.status("tracing the network (a minute or so)"):
-            graphs = freeze(network, description, fixed, Path(working))
+            graphs = freeze(network, description, fixed, make_folder(working / "graphs"))
         say(f"traced: {graphs.nodes} nodes, opset {OPSET}, {graphs.bytes / 1e6:.0f} MB")
-        rows = []
+        fused = hand_out(graphs.whole, make_folder(folders[out.parent] / "fused") / out.name) if out else []
+        new = make_folder(folders[staged.parent] / "staged") if staged else None
+        stages = _write_stages(graphs, new) if new else [(stage, graphs.of_stage(stage)) for stage in graphs.stages]
+        errors = []
         with console.status("verifying against PyTorch") as status:
-            for row in verify(network, graphs, description, fixed):
-                rows.append(row)
-                status.update(f"verifying against PyTorch: {row.stage}, {row.case}")
-        _print_table(rows)
-        if not all(row.passed for row in rows):
+            exported = Exported(stages, staged is not None, fused[0] if fused else None)
+            for error in verify(network, exported, description, fixed):
+                errors.append(error)
+                status.update(f"verifying against PyTorch: {error.stage}, {error.case}")
+        (print_details if verbose else print_summary)(errors)
+        if not all(error.passed for error in errors):
             return False
         if out is not None:
-            _say_written(hand_out(graphs.whole, out), out, description)
-        if staged is not None:
-            _write_stages(graphs, staged)
+            _say_written(publish(fused, out.parent), out, description)
+        if staged is not None and new is not None:
+            replace_folder(new, staged)
             _say_written([staged], staged, description)
     return True
 
 
-def _write_stages(graphs: "Graphs", staged: Path) -> None:
-    """One graph a stage and the manifest, in a folder that appears whole."""
+def _write_stages(graphs: "Graphs", folder: Path) -> "list[tuple[Stage, Path]]":
+    """Write one graph a stage and the manifest into an empty folder; the stages, each with its graph."""
     from .weights import hand_out
 
-    temporary = Path(tempfile.mkdtemp(prefix=f".{staged.name}.", dir=staged.parent))
-    try:
-        files = []
-        for stage in graphs.stages:
-            files.append(StageFile(stage.name, f"{stage.name}.onnx", list(stage.inputs), list(stage.outputs)))
-            hand_out(graphs.of_stage(stage), temporary / files[-1].file)
-        write_manifest(temporary, files)
-        temporary.chmod(0o755)
-        if staged.exists():
-            shutil.rmtree(staged)
-        temporary.rename(staged)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    files = [
+        StageFile(stage.name, f"{stage.name}.onnx", list(stage.inputs), list(stage.outputs)) for stage in graphs.stages
+    ]
+    for stage, file in zip(graphs.stages, files, strict=True):
+        hand_out(graphs.of_stage(stage), folder / file.file)
+    write_manifest(folder, files)
+    return [(stage, folder / file.file) for stage, file in zip(graphs.stages, files, strict=True)]
 
 
 def _say_written(paths: list[Path], model: Path, description: Description) -> None:
@@ -212,19 +254,3 @@ def _say_written(paths: list[Path], model: Path, description: Description) -> No
         say(f"{paths[1].name} holds the weights: move it along with {model.name}")
     makes = "a splat" if description.gaussians else "depth and a point cloud"
     say(f"make {makes} with: idesplat-infer --model {model} --images ... --cameras ... --out scene.ply")
-
-
-def _print_table(rows: "list[Parity]") -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(title="ONNX Runtime against PyTorch, in standard deviations of each tensor")
-    for column in ("case", "stage", "tensor"):
-        table.add_column(column)
-    for column in ("largest", "median", "tolerance"):
-        table.add_column(column, justify="right")
-    table.add_column("verdict")
-    for row in rows:
-        numbers = (f"{value:.1e}" for value in (row.largest, row.median, row.tolerance))
-        table.add_row(row.case, row.stage, row.tensor, *numbers, "ok" if row.passed else "DEPARTS")
-    Console(width=None if sys.stdout.isatty() else 120).print(table)

@@ -14,6 +14,7 @@ from ..runtime.bundle import INPUTS, METADATA_KEY, OUTPUTS, Description
 from .int8 import Feeds
 from .optimize import simplify
 from .precision import in_precision
+from .room import room_inputs
 from .sparse_products import explain, in_steps
 from .stages import NamedTensors, Stage, example_inputs, find_stages, stage_graph
 from .weights import fill_inputs
@@ -82,11 +83,12 @@ def freeze(network: NamedTensors, description: Description, fixed: Fixed, folder
 
 
 def _examples(description: Description, fixed: Fixed) -> Iterator[Feeds]:
-    """Inputs upright and across, to see what ranges a network's numbers have."""
+    """Noise and a room, upright and across, to see what ranges a network's numbers have."""
     across = tuple(blocks * description.size_multiple for blocks in TRACE_BLOCKS)
     for height, width in [fixed.size] if fixed.size else [across, across[::-1]]:
-        inputs = example_inputs(fixed.views or TRACE_VIEWS, height, width, description.near, description.far)
-        yield {name: tensor.numpy() for name, tensor in inputs.items()}
+        for make in (example_inputs, room_inputs):
+            inputs = make(fixed.views or TRACE_VIEWS, height, width, description.near, description.far)
+            yield {name: tensor.numpy() for name, tensor in inputs.items()}
 
 
 def trace(network: NamedTensors, description: Description, fixed: Fixed, folder: Path) -> onnx.ModelProto:

@@ -1,5 +1,6 @@
 """Products of features in int8: transformers quantised as they run, convolutions by ranges found beforehand."""
 
+import logging
 import math
 from collections.abc import Iterable
 from pathlib import Path
@@ -40,15 +41,19 @@ def in_int8(
     tensors = {name for node in convolutions for name in (node.input[0], node.output[0])}
     ranges = _ranges(source, graph, sorted(tensors), examples)
     dynamic = source.with_name("dynamic.onnx")
-    quantize_dynamic(
-        source,
-        dynamic,
-        op_types_to_quantize=["MatMul"],
-        nodes_to_quantize=[node.name for node in weighted if node.op_type == "MatMul"],
-        weight_type=QuantType.QInt8,
-        use_external_data_format=True,
-        extra_options={"MatMulConstBOnly": True},
-    )
+    logging.disable(logging.WARNING)  # it advises to prepare the graph, which `simplify` has done
+    try:
+        quantize_dynamic(
+            source,
+            dynamic,
+            op_types_to_quantize=["MatMul"],
+            nodes_to_quantize=[node.name for node in weighted if node.op_type == "MatMul"],
+            weight_type=QuantType.QInt8,
+            use_external_data_format=True,
+            extra_options={"MatMulConstBOnly": True},
+        )
+    finally:
+        logging.disable(logging.NOTSET)
     return _Convolutions(onnx.load(dynamic), {node.name for node in convolutions}, ranges).rounded()
 
 

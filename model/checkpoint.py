@@ -4,6 +4,9 @@ import functools
 import hashlib
 import pickle
 import re
+import struct
+import warnings
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -22,8 +25,11 @@ DEPTH_PREFIX = "depth_predictor."
 DEPTH_ONLY = "pretrained."
 # Released files name the first digits of their SHA-256.
 NAMED_HASH = re.compile(r"-([0-9a-f]{8})\.pth$")
-# Keys an error message shows before it only counts.
+# Keys an error message shows before it only counts, and the most characters of a key or a reason that it shows.
 SHOWN = 4
+LONGEST_SHOWN = 100
+# What weights may be stored in; they are used in float32.
+FLOATS = (torch.float32, torch.float16, torch.bfloat16, torch.float64)
 
 
 class CheckpointError(ValueError):
@@ -43,17 +49,23 @@ def load_idesplat(path: Path, config: IDESplatConfig) -> IDESplat:
 def read_state_dict(path: Path) -> dict[str, Tensor]:
     """The encoder's tensors of a checkpoint file by their released names, without running code that the file may hold.
 
-    Raises CheckpointError.
+    Raises CheckpointError; also for tensors that are no plain arrays on the CPU.
     """
     _check_file(path)
-    content = _read_safetensors(path) if path.suffix == ".safetensors" else _read_pickle(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of PyTorch, about what the file holds; what cannot be used is refused below
+        content = _read_safetensors(path) if path.suffix == ".safetensors" else _read_pickle(path)
     for container in CONTAINERS:
         if isinstance(content, dict) and isinstance(content.get(container), dict):
             content = content[container]
             break
     if not isinstance(content, dict):
         raise CheckpointError(f"{path}: holds a {type(content).__name__}, expected a state dict; is it a checkpoint?")
-    tensors = {key: value for key, value in content.items() if isinstance(value, Tensor)}
+    tensors: dict[str, Tensor] = {}
+    for key, value in content.items():
+        if isinstance(value, Tensor):
+            name = _text(path, key)
+            tensors[name] = _plain(path, name, value)
     # Released files alone have a depth predictor; this project's own have a stage called encoder. Other prefixes belong
     # to the loss and are not ours.
     if any(key.startswith(PREFIX + DEPTH_PREFIX) for key in tensors):
@@ -65,11 +77,46 @@ def read_state_dict(path: Path) -> dict[str, Tensor]:
     return tensors
 
 
+def _text(path: Path, key: object) -> str:
+    """A state dict's key; raises CheckpointError if it is no text."""
+    if not isinstance(key, str):
+        raise CheckpointError(
+            f"{path}: holds a tensor under a key of type {type(key).__name__}, expected names of parameters; "
+            "is it a checkpoint?"
+        )
+    return str(key)
+
+
+def _plain(path: Path, key: str, value: Tensor) -> Tensor:
+    """A tensor without attributes or gradient; raises CheckpointError unless it is a plain array on the CPU."""
+    kinds = {
+        "sparse": value.layout is not torch.strided,
+        "nested": value.is_nested,
+        "quantized": value.is_quantized,
+        "without values (on the meta device)": value.device.type == "meta",
+    }
+    for kind, found in kinds.items():
+        if found:
+            raise CheckpointError(
+                f"{path}: {_shown_text(key)} is {kind}, expected a dense tensor; save the state dict with dense tensors"
+            )
+    return torch.Tensor.detach(value)  # a loaded tensor's own attributes may hide methods
+
+
+def _shown_text(text: str) -> str:
+    """Something of a file as an error message may show it: short, in one line, without control characters."""
+    text = text if text.isprintable() and text.isascii() else ascii(text)
+    return text if len(text) <= LONGEST_SHOWN else text[:LONGEST_SHOWN] + "..."
+
+
 def file_sha256(path: Path) -> str:
-    """The SHA-256 of a file in hex digits; raises CheckpointError if there is none."""
+    """The SHA-256 of a file in hex digits; raises CheckpointError if there is none, or it cannot be read."""
     _check_file(path)
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be read ({error.strerror}); expected a checkpoint") from None
 
 
 def name_hash_warning(path: Path, digest: str) -> str | None:
@@ -81,23 +128,29 @@ def name_hash_warning(path: Path, digest: str) -> str | None:
 
 
 def _check_file(path: Path) -> None:
-    if not path.is_file():
-        raise CheckpointError(
-            f"{path}: no such file; give the path of a released checkpoint (.ckpt, .pth or .safetensors)"
-        )
+    try:
+        exists, regular = path.exists(), path.is_file()
+    except OSError as error:  # such as a name that is too long
+        raise CheckpointError(f"{path}: cannot be read ({error.strerror}); expected a checkpoint") from None
+    if not regular:
+        found = "not a regular file" if exists else "no such file"
+        raise CheckpointError(f"{path}: {found}; give the path of a released checkpoint (.ckpt, .pth or .safetensors)")
 
 
 def _read_safetensors(path: Path) -> object:
-    from safetensors import SafetensorError
     from safetensors.torch import load_file
 
     try:
         return load_file(path)
-    except (SafetensorError, OSError, ValueError) as error:
-        raise CheckpointError(f"{path}: not a readable safetensors file ({error}); download it again") from None
+    except Exception as error:  # its own, of PyTorch for types that it does not know, of the system
+        raise CheckpointError(
+            f"{path}: not a readable safetensors file ({_reason(error)}); download it again"
+        ) from None
 
 
 def _read_pickle(path: Path) -> object:
+    """What torch.save wrote; only tensors and plain containers are rebuilt, whatever the pickle asks for."""
+    _check_archive(path)
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
@@ -107,9 +160,28 @@ def _read_pickle(path: Path) -> object:
             f"{path}: {what}; only tensors and plain containers are loaded, because a pickle can run any code. "
             "Save the state dict alone, or as .safetensors, on a machine where you trust the file"
         ) from None
-    except (RuntimeError, EOFError, OSError, ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise CheckpointError(f"{path}: not a readable checkpoint ({reason}); download it again") from None
+    except Exception as error:  # damaged content may raise any exception in the unpickler and where tensors are rebuilt
+        raise CheckpointError(f"{path}: not a readable checkpoint ({_reason(error)}); download it again") from None
+
+
+def _check_archive(path: Path) -> None:
+    """Refuse an archive whose entries claim more bytes than the file has: torch.save neither packs nor shares them."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            claimed = sum(entry.file_size for entry in archive.infolist())
+    except (OSError, ValueError, NotImplementedError, zipfile.BadZipFile, struct.error):
+        return  # no archive, as PyTorch's older format is none, or a damaged one, which torch.load refuses
+    if claimed > path.stat().st_size:
+        raise CheckpointError(
+            f"{path}: claims to hold {claimed} bytes in a file of {path.stat().st_size}, expected an archive as "
+            "torch.save writes it, not packed; unpack it, or download it again"
+        )
+
+
+def _reason(error: Exception) -> str:
+    """The beginning of an exception's message."""
+    lines = str(error).strip().splitlines()
+    return _shown_text(lines[0]) if lines else type(error).__name__
 
 
 def fitting_presets(tensors: dict[str, Tensor]) -> list[str]:
@@ -148,7 +220,10 @@ def _words(name: str) -> set[str]:
 
 
 def fill(model: Network, tensors: dict[str, Tensor], path: Path) -> None:
-    """Load released tensors into a model; raises CheckpointError naming the first keys that differ."""
+    """Load released tensors into a model.
+
+    Raises CheckpointError naming the first keys that differ, or whose values are no floating-point or finite numbers.
+    """
     renamed = rename_released(tensors)
     own = model.state_dict()
     different = _differences({key: tuple(value.shape) for key, value in own.items()}, renamed)
@@ -156,7 +231,22 @@ def fill(model: Network, tensors: dict[str, Tensor], path: Path) -> None:
         raise CheckpointError(
             f"{path}: does not fit the network: {_shown(different)}; choose the preset it was trained with"
         )
+    _check_values(renamed, path)
     model.load_state_dict({key: value.reshape(own[key].shape) for key, value in renamed.items()})
+
+
+def _check_values(tensors: dict[str, Tensor], path: Path) -> None:
+    """Refuse weights, whose shapes are known to fit, that are no numbers to compute with."""
+    integers = [f"{key} holds {value.dtype}" for key, value in tensors.items() if value.dtype not in FLOATS]
+    if integers:
+        raise CheckpointError(
+            f"{path}: {_shown(integers)}; expected floating-point weights, such as torch.float32: save it with those"
+        )
+    damaged = [f"{key} holds NaN or infinity" for key, value in tensors.items() if not value.isfinite().all()]
+    if damaged:
+        raise CheckpointError(
+            f"{path}: {_shown(damaged)}; expected finite weights: download it again, or save an earlier state"
+        )
 
 
 @functools.cache
@@ -168,7 +258,7 @@ def _expected_shapes(config: IDESplatConfig | DepthSplatConfig) -> dict[str, tup
 def _differences(expected: dict[str, tuple[int, ...]], tensors: dict[str, Tensor]) -> list[str]:
     """What differs, in words: missing keys, keys unknown, shapes."""
     missing = [f"{key} is missing" for key in expected if key not in tensors]
-    unknown = [f"{key} is unknown" for key in tensors if key not in expected]
+    unknown = [f"{_shown_text(key)} is unknown" for key in tensors if key not in expected]
     shapes = [
         f"{key} has shape {tuple(tensors[key].shape)} instead of {shape}"
         for key, shape in expected.items()

@@ -10,11 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from idesplat.export.cases import Case
 from idesplat.export.cli import describe
 from idesplat.export.exporter import Fixed, freeze
 from idesplat.export.precision import PRECISIONS
 from idesplat.export.stages import NamedTensors
-from idesplat.export.verify import Case, stage_errors
+from idesplat.export.verify import Exported, compare, tolerance_for
 from idesplat.model.checkpoint import fill
 from idesplat.model.gaussian_adapter import WorldGaussians
 from idesplat.model.networks import Network, build
@@ -63,13 +64,15 @@ def variants(
 
     network = NamedTensors(model)
     feeds = {name: value.numpy() for name, value in zip(INPUTS, inputs, strict=True)}
-    between = Case("", feeds | {name: value.numpy() for name, value in network.named(*inputs).items()})
+    between = Case("", len(inputs[0]), feeds | {name: value.numpy() for name, value in network.named(*inputs).items()})
     runs: dict[str, Run] = {"PyTorch": eager}
     stages: dict[str, float | None] = {"PyTorch": None}
     for precision in PRECISIONS:
         (folder / precision).mkdir()
         graphs = freeze(network, describe(model, "", "", "", Fixed(), precision), Fixed(), folder / precision)
-        stages[precision] = max(row.median for row in stage_errors(graphs, [between], precision))
+        exported = Exported([(stage, graphs.of_stage(stage)) for stage in graphs.stages], staged=False)
+        rows = compare(exported, [between], tolerance_for(network, precision))
+        stages[precision] = max(row.errors.median for row in rows)
         session = open_session(graphs.whole, tuning=Tuning(THREADS))
         runs[precision] = lambda session=session: {
             name: torch.from_numpy(value) for name, value in run_session(session, feeds).items()

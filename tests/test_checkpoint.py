@@ -2,6 +2,8 @@
 
 import os
 import pickle
+import random
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -10,6 +12,7 @@ from conftest import SMALL, small_network
 from idesplat.model.checkpoint import (
     UNUSED,
     CheckpointError,
+    file_sha256,
     fill,
     fitting_presets,
     infer_preset,
@@ -130,6 +133,106 @@ def test_a_missing_file_and_a_file_without_tensors(tmp_path):
     torch.save({"epoch": 3}, tmp_path / "empty.ckpt")
     with pytest.raises(CheckpointError, match="no tensors"):
         read_state_dict(tmp_path / "empty.ckpt")
+
+
+# ---- what no checkpoint holds: each refused in one line, with no exception but CheckpointError
+
+
+def _replaced(value):
+    """The small network's state dict with one tensor replaced."""
+    return {**small_network().state_dict(), "dpbu1.merge.conv.bias": value}
+
+
+ODD_CONTENTS = {
+    "a key that is a number": (lambda: {7: torch.zeros(2)}, "key of type int"),
+    "a key that is a tuple": (lambda: {("a", "b"): torch.zeros(2)}, "key of type tuple"),
+    "a key of bytes among text": (lambda: {"a": torch.zeros(2), b"b": torch.zeros(2)}, "key of type bytes"),
+    "an empty key": (lambda: {"": torch.zeros(2)}, "does not fit"),
+    "a key of many lines": (
+        lambda: {**small_network().state_dict(), "a\nb\x1b[2J\udcff": torch.zeros(2)},
+        r"'a\nb\x1b[2J\udcff' is unknown",
+    ),
+    "sparse": (lambda: _replaced(torch.eye(64).to_sparse()), "is sparse"),
+    "compressed sparse": (lambda: _replaced(torch.eye(64).to_sparse_csr()), "is sparse"),
+    "without values": (lambda: _replaced(torch.empty(64, device="meta")), "without values"),
+    "quantized": (lambda: _replaced(torch.quantize_per_tensor(torch.zeros(64), 0.1, 0, torch.qint8)), "is quantized"),
+    "integers": (lambda: _replaced(torch.zeros(64, dtype=torch.int64)), "holds torch.int64"),
+    "complex": (lambda: _replaced(torch.zeros(64, dtype=torch.complex64)), "holds torch.complex64"),
+    "truth values": (lambda: _replaced(torch.zeros(64, dtype=torch.bool)), "holds torch.bool"),
+    "NaN": (lambda: _replaced(torch.full((64,), torch.nan)), "dpbu1.merge.conv.bias holds NaN or infinity"),
+    "infinity": (lambda: _replaced(torch.full((64,), torch.inf)), "holds NaN or infinity"),
+    "a list": (lambda: [torch.zeros(2)], "holds a list"),
+    "text": (lambda: "hello", "holds a str"),
+    "nothing": (lambda: None, "holds a NoneType"),
+    "far more values than bytes": (lambda: _replaced(torch.zeros(1).expand(1 << 40)), "has shape (1099511627776,)"),
+}
+
+
+@pytest.mark.parametrize("legacy", (False, True))
+@pytest.mark.parametrize("name", ODD_CONTENTS)
+def test_odd_contents_are_refused_in_one_line(tmp_path, name, legacy, recwarn):
+    make, expected = ODD_CONTENTS[name]
+    path = tmp_path / "odd.pth"
+    torch.save(make(), path, _use_new_zipfile_serialization=not legacy)
+    recwarn.clear()
+    with pytest.raises(CheckpointError) as error:
+        load_idesplat(path, SMALL)
+    message = str(error.value)
+    assert expected in message and "odd.pth" in message
+    assert message.isprintable() and len(message) < 800
+    assert not recwarn.list
+
+
+def test_half_precision_is_taken(tmp_path):
+    tensors = {key: value.half() for key, value in small_network().state_dict().items()}
+    torch.save(tensors, tmp_path / "half.pth")
+    assert next(load_idesplat(tmp_path / "half.pth", SMALL).parameters()).dtype == torch.float32
+
+
+def test_a_tensor_with_attributes_of_its_own_is_used_as_a_tensor(tmp_path):
+    """A file may give a parameter any attribute, also one that hides a method of tensors."""
+    tensors = small_network().state_dict()
+    weight = torch.nn.Parameter(tensors["dpbu1.merge.conv.bias"])
+    weight.reshape = weight.isfinite = weight.squeeze = "text"
+    torch.save({**tensors, "dpbu1.merge.conv.bias": weight}, tmp_path / "odd.pth")
+    assert load_idesplat(tmp_path / "odd.pth", SMALL)
+
+
+@pytest.mark.parametrize("legacy", (False, True))
+def test_damaged_files_raise_nothing_else(tmp_path, legacy):
+    """Truncated, and with bytes replaced: PyTorch raises whatever its unpickler meets."""
+    path = tmp_path / "damaged.pth"
+    torch.save({"a": torch.zeros(3), "b": {"c": torch.ones(2)}}, path, _use_new_zipfile_serialization=not legacy)
+    whole = path.read_bytes()
+    rng = random.Random(0)
+    for attempt in range(300):
+        content = bytearray(whole)
+        for _ in range(rng.randint(1, 4)):
+            content[rng.randrange(len(content))] = rng.randrange(256)
+        path.write_bytes(content[: rng.randrange(len(content))] if attempt % 3 == 0 else content)
+        try:
+            read_state_dict(path)
+        except CheckpointError as error:
+            assert str(error).isprintable()
+
+
+def test_a_packed_archive_is_refused_before_it_is_unpacked(tmp_path):
+    path = tmp_path / "packed.pth"
+    torch.save({"a": torch.zeros(1 << 20)}, tmp_path / "plain.pth")
+    with zipfile.ZipFile(tmp_path / "plain.pth") as plain, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as packed:
+        for name in plain.namelist():
+            packed.writestr(name, plain.read(name))
+    with pytest.raises(CheckpointError, match="claims to hold"):
+        read_state_dict(path)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="named pipes are of POSIX")
+@pytest.mark.parametrize("read", (read_state_dict, file_sha256))
+def test_a_named_pipe_and_a_name_that_is_too_long_are_refused(tmp_path, read):
+    os.mkfifo(tmp_path / "pipe.pth")
+    for path, expected in ((tmp_path / "pipe.pth", "not a regular file"), (tmp_path / ("a" * 300), "cannot be read")):
+        with pytest.raises(CheckpointError, match=expected):
+            read(path)
 
 
 def test_every_preset_can_be_told_from_its_released_name(released):

@@ -1,6 +1,9 @@
 """The exported files: standard, self-describing, dynamic, and equal to the network."""
 
+import errno
 import json
+import os
+import shutil
 
 import numpy as np
 import onnx
@@ -9,7 +12,7 @@ import torch
 from conftest import SMALL_PRESET, run_command, small_network
 from idesplat.export import cli
 from idesplat.export.stages import example_inputs
-from idesplat.export.verify import Parity
+from idesplat.export.verify import Figures, TensorError
 from idesplat.runtime.bundle import INPUTS, OUTPUTS, read_description, read_manifest
 from idesplat.runtime.runner import Runner
 
@@ -113,29 +116,31 @@ def test_fixed_views_and_size(small_checkpoint, presets, tmp_path, capsys):
 
 
 def test_a_departing_graph_leaves_no_file(small_checkpoint, presets, tmp_path, monkeypatch, capsys):
-    breach = Parity("2 views", "encoder", "encoder.features_mv", 3.0, 1.0, 1e-3)
-    monkeypatch.setattr("idesplat.export.verify.verify", lambda *_: iter([breach]))
+    mismatch = TensorError("2 views", "encoder", "encoder.features_mv", Figures(1, 2, 3), Figures(1, 2, 2), 3.0)
+    monkeypatch.setattr("idesplat.export.verify.verify", lambda *_: iter([mismatch]))
     out, staged = tmp_path / "model.onnx", tmp_path / "staged"
     assert run_command(cli.main, small_checkpoint, out, "--staged", staged) == 1
     assert list(tmp_path.iterdir()) == []
-    assert "DEPARTS" in capsys.readouterr().out
+    assert "MISMATCH" in capsys.readouterr().out
 
 
-def test_verification_notices_a_wrong_graph(exported, tmp_path):
+def test_verification_notices_a_wrong_graph(exported):
     """The very comparison that guards the export fails when the weights differ by one part in ten of one tensor."""
-    from idesplat.export.exporter import Fixed, freeze
-    from idesplat.export.stages import NamedTensors
-    from idesplat.export.verify import verify
+    from idesplat.export.exporter import Fixed
+    from idesplat.export.stages import NamedTensors, Stage
+    from idesplat.export.verify import Exported, verify
 
     network = NamedTensors(small_network())
     properties = {entry.key: entry.value for entry in onnx.load(exported[0]).metadata_props}
     description = read_description(properties, exported[0])
-    graphs = freeze(network, description, Fixed(), tmp_path)
     with torch.no_grad():
         network.model.dpbu1.merge.conv.weight *= 1.1
-    rows = list(verify(network, graphs, description, Fixed()))
-    assert "dpbu1" in {row.stage for row in rows if not row.passed}
-    assert not {row.stage for row in rows if not row.passed} & {"encoder", "dpbu2", "dpbu3", "gaussians"}
+    stages = [
+        (Stage(stage.name, tuple(stage.inputs), tuple(stage.outputs)), exported[1] / stage.file)
+        for stage in read_manifest(exported[1])
+    ]
+    rows = list(verify(network, Exported(stages, staged=False), description, Fixed()))
+    assert {row.stage for row in rows if not row.passed} == {"dpbu1"}
 
 
 ERRORS = {
@@ -149,7 +154,16 @@ ERRORS = {
     "bad size": (["weights.pth", "out.onnx", "--size", "64"], "HEIGHTxWIDTH"),
     "size not a multiple": (["weights.pth", "out.onnx", "--size", "64x70"], "multiples of 16"),
     "staged is a file": (["weights.pth", "--staged", "text.pth"], "is a file"),
-    "staged holds other files": (["weights.pth", "--staged", "."], "holds other files"),
+    "staged holds other files": (["weights.pth", "--staged", "."], "holds app, which"),
+    "staged is a data folder": (["weights.pth", "--staged", "app"], "holds index.html, which"),
+    "out is not ours": (["weights.pth", "foreign.onnx"], "idesplat-export did not write it"),
+    "out is a folder": (["weights.pth", "folder.onnx"], "not a regular file"),
+    "out is the checkpoint": (["weights.onnx", "./weights.onnx"], "is the checkpoint"),
+    "out is in the staged folder": (["weights.pth", "new/a.onnx", "--staged", "new"], "outside it"),
+    "too many pixels": (["weights.pth", "out.onnx", "--size", "65536x65536"], "more than 16,777,216 pixels"),
+    "a name too long": (["weights.pth", f"{'a' * 300}.onnx"], "File name too long"),
+    "links in a circle": (["weights.pth", "--staged", "circle"], "choose another name"),
+    "a pipe": (["pipe.pth", "out.onnx"], "not a regular file"),
 }
 
 
@@ -157,15 +171,39 @@ ERRORS = {
 def test_errors_are_one_line(name, small_checkpoint, presets, tmp_path, monkeypatch, capsys):
     arguments, expected = ERRORS[name]
     (tmp_path / "weights.pth").write_bytes(small_checkpoint.read_bytes())
+    shutil.copy(tmp_path / "weights.pth", tmp_path / "weights.onnx")
     (tmp_path / "text.pth").write_text("hello")
+    (tmp_path / "foreign.onnx").write_text("not ours")
+    os.mkfifo(tmp_path / "pipe.pth")
+    (tmp_path / "circle").symlink_to(tmp_path / "circle")
+    for folder in ("folder.onnx", "app", "new"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "app" / "manifest.json").write_text('{"name": "app"}')
+    (tmp_path / "app" / "index.html").write_text("hello")
     monkeypatch.chdir(tmp_path)
-    before = sorted(tmp_path.iterdir())
+    before = sorted(tmp_path.rglob("*"))
     assert run_command(cli.main, *arguments) == 2
     message = capsys.readouterr().err
     assert message.startswith("error: ")
     assert expected in message
     assert message.count("\n") == 1
-    assert sorted(tmp_path.iterdir()) == before
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_more_views_than_can_be_traced_are_refused(small_checkpoint, tmp_path, capsys):
+    assert run_command(cli.main, small_checkpoint, tmp_path / "out.onnx", "--views", 65) == 2
+    assert "64" in capsys.readouterr().err
+
+
+def test_a_full_disk_is_named_and_leaves_nothing(small_checkpoint, presets, tmp_path, monkeypatch, capsys):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("idesplat.export.exporter.freeze", full)
+    assert run_command(cli.main, small_checkpoint, tmp_path / "out.onnx", "--staged", tmp_path / "staged") == 2
+    message = capsys.readouterr().err.splitlines()[-1]
+    assert message.startswith("error: ") and "No space left on device" in message
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_metadata_of_another_layout_is_refused(tmp_path):
