@@ -26,14 +26,14 @@ check: setup
 
 # Photographs of a drawn room to a splat, in demo/.
 demo: setup
-	$(BIN)/python -m idesplat.tools.demo demo
+	$(BIN)/python -P -m idesplat.tools.demo demo
 
 # The carried model, trained from nothing: five hours of one core. Stopped at any moment, it goes on where it was.
 weights: setup
 	$(BIN)/idesplat-train --out runs/tiny --steps 4000 --batch 1 --size 256 --seed 0
 	$(BIN)/idesplat-train --out runs/finer --init runs/tiny/last.ckpt --no-gradual \
 		--steps 1200 --lr 5e-4 --vit-lr 2e-4 --batch 1 --size 256 --seed 1
-	$(BIN)/python -m idesplat.tools.carry runs/finer/last.ckpt
+	$(BIN)/python -P -m idesplat.tools.carry runs/finer/last.ckpt
 
 clean:
 	rm -rf $(VENV) build .typing *.egg-info

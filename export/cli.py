@@ -12,8 +12,9 @@ import typer
 
 from ..runtime.bundle import MANIFEST_NAME, Description, StageFile, write_manifest
 from ..runtime.errors import InputError, exit_on_input_error
-from ..runtime.files import check_writable, make_folder
+from ..runtime.outputs import Overwrite, guards_outputs, outputs
 from ..runtime.sizes import parse_size, size_fits, size_rule
+from ..runtime.terminal import run, say, warn
 
 if TYPE_CHECKING:
     from ..model.networks import Network
@@ -24,6 +25,7 @@ PARITY_BREACH = 1
 
 
 @exit_on_input_error
+@guards_outputs("idesplat-export")
 def export(
     checkpoint: Annotated[
         Path, typer.Argument(help="Released checkpoint: .ckpt, .pth or .safetensors.", show_default=False)
@@ -38,11 +40,13 @@ def export(
     precision: Annotated[
         str, typer.Option(help="float32, int8 (for processors) or fp16 (for graphics cards).")
     ] = "float32",
+    overwrite: Overwrite = False,
 ) -> None:
     """Write a checkpoint as a standard ONNX graph (opset 20), and prove that it computes the same.
 
     Views, height and width stay dynamic unless fixed by --views and --size.
     """
+    outputs().reads("the checkpoint", [checkpoint])
     folder = _check_targets(out, staged)
     if find_spec("torch") is None or find_spec("onnx") is None:
         raise InputError("exporting needs PyTorch and onnx, which are not installed; pip install 'idesplat[export]'")
@@ -59,13 +63,13 @@ def export(
     fixed = Fixed(views, _fitting_size(size, model.config.size_multiple) if size else None)
     description = describe(model, name, checkpoint.name, digest, fixed, precision)
     if not _export(model, description, fixed, folder, out, staged):
-        print("error: the graph departs from the network (see the table); nothing was written", file=sys.stderr)
+        warn("error: the graph departs from the network (see the table); nothing was written")
         raise SystemExit(PARITY_BREACH)
 
 
 def main() -> None:
     """Entry point of idesplat-export."""
-    typer.run(export)
+    run(export)
 
 
 def _check_targets(out: Path | None, staged: Path | None) -> Path:
@@ -76,13 +80,15 @@ def _check_targets(out: Path | None, staged: Path | None) -> Path:
     if out is not None:
         if out.suffix != ".onnx":
             raise InputError(f"{out}: the output must end in .onnx")
-        check_writable(out.parent)
+        outputs().writes("", [out])
+        outputs().make_folder(out.parent)
     if staged is not None:
         if staged.exists() and not staged.is_dir():
             raise InputError(f"--staged {staged}: is a file, expected a folder")
         if staged.is_dir() and any(staged.iterdir()) and not (staged / MANIFEST_NAME).is_file():
             raise InputError(f"--staged {staged}: holds other files; choose an empty or new folder")
-        check_writable(make_folder(staged.parent))
+        outputs().writes_into("--staged", staged)
+        outputs().make_folder(staged.parent)
     return folders[0]
 
 
@@ -102,17 +108,17 @@ def _load(checkpoint: Path, preset: str | None) -> "tuple[Network, str, str]":
 
     if preset is not None and preset not in PRESETS:
         raise InputError(f"--preset {preset}: unknown; choose one of {', '.join(PRESETS)}")
-    print(f"reading {checkpoint}")
+    say(f"reading {checkpoint}")
     digest = file_sha256(checkpoint)
     warning = name_hash_warning(checkpoint, digest)
     if warning:
-        print(f"warning: {warning}", file=sys.stderr)
+        warn(f"warning: {warning}")
     tensors = read_state_dict(checkpoint)
     name = preset or infer_preset(checkpoint, tensors)
     model = build(name)
     fill(model, tensors, checkpoint)
     count = sum(parameter.numel() for parameter in model.parameters())
-    print(f"preset {name}, {count:,} parameters")
+    say(f"preset {name}, {count:,} parameters")
     return model.eval(), name, digest
 
 
@@ -163,7 +169,7 @@ def _export(
     with tempfile.TemporaryDirectory(prefix=".idesplat-export.", dir=folder) as working:
         with console.status("tracing the network (a minute or so)"):
             graphs = freeze(network, description, fixed, Path(working))
-        print(f"traced: {graphs.nodes} nodes, opset {OPSET}, {graphs.bytes / 1e6:.0f} MB")
+        say(f"traced: {graphs.nodes} nodes, opset {OPSET}, {graphs.bytes / 1e6:.0f} MB")
         rows = []
         with console.status("verifying against PyTorch") as status:
             for row in verify(network, graphs, description, fixed):
@@ -201,11 +207,11 @@ def _write_stages(graphs: "Graphs", staged: Path) -> None:
 
 def _say_written(paths: list[Path], model: Path, description: Description) -> None:
     """What was written and how to use it."""
-    print("\n".join(f"wrote {path}" for path in paths))
+    say(*(f"wrote {path}" for path in paths))
     if len(paths) > 1:
-        print(f"{paths[1].name} holds the weights: move it along with {model.name}")
+        say(f"{paths[1].name} holds the weights: move it along with {model.name}")
     makes = "a splat" if description.gaussians else "depth and a point cloud"
-    print(f"make {makes} with: idesplat-infer --model {model} --images ... --cameras ... --out scene.ply")
+    say(f"make {makes} with: idesplat-infer --model {model} --images ... --cameras ... --out scene.ply")
 
 
 def _print_table(rows: "list[Parity]") -> None:

@@ -6,6 +6,8 @@ The names below load their module when first used, so that importing the package
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from . import startup as startup
+
 if TYPE_CHECKING:
     from .cameras import Camera, read_cameras
     from .errors import InputError

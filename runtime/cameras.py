@@ -15,6 +15,7 @@ import numpy as np
 
 from .camera_format import CameraFormat
 from .errors import InputError
+from .files import open_regular
 
 RIGID_TOLERANCE = 1e-3  # how far a rotation's singular values may be from 1
 RIGID_ROUNDING = 1e-12  # below this a rotation is left as it is, so that what we write is read back unchanged
@@ -113,7 +114,7 @@ def recognise(path: Path) -> CameraFormat:
     if path.name in {name + suffix for name in COLMAP_PARTS for suffix in (".bin", ".txt")}:
         return CameraFormat.COLMAP
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             start = file.read(START).removeprefix(b"\xef\xbb\xbf").lstrip()
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror}); expected a file of cameras") from None

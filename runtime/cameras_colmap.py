@@ -20,6 +20,7 @@ import numpy as np
 from .camera_fields import calibration
 from .cameras import COLMAP_PARTS, Camera, invert_rigid, located
 from .errors import InputError
+from .files import check_regular, open_regular
 from .sparse_depth import range_of_depths
 
 if TYPE_CHECKING:
@@ -90,11 +91,15 @@ def _read_apart(model: Path) -> list[dict[str, Any]]:
     if importlib.util.find_spec("pycolmap") is None:
         raise InputError(f"is a COLMAP model, for which pycolmap is needed; {INSTALL}")
     files = [file for file in model.iterdir() if file.suffix in SUFFIXES]
+    for file in files:
+        check_regular(file)
     _check_counts(files)
     size = sum(file.stat().st_size for file in files)
-    command = [sys.executable, "-m", __name__, str(model), str(MEMORY + MEMORY_PER_BYTE * size)]
+    # -P: or else Python would look for modules in the current folder first
+    command = [sys.executable, "-P", "-m", __name__, str(model.absolute()), str(MEMORY + MEMORY_PER_BYTE * size)]
+    seconds = SECONDS + SECONDS_PER_MB * size / 1e6
     try:
-        done = subprocess.run(command, capture_output=True, timeout=SECONDS + SECONDS_PER_MB * size / 1e6)
+        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=seconds)
     except subprocess.TimeoutExpired:
         raise InputError("COLMAP's library did not finish reading this model; is it damaged?") from None
     if done.returncode != 0:
@@ -110,7 +115,7 @@ def _check_counts(files: Sequence[Path]) -> None:
     """Refuse a binary file whose first number, the count of its records, promises more than the file can hold."""
     for file in files:
         if file.suffix == ".bin" and file.stem in COLMAP_PARTS:
-            with file.open("rb") as opened:
+            with open_regular(file) as opened:
                 count = int.from_bytes(opened.read(COUNT_BYTES), "little")
             if count * SMALLEST_RECORD > file.stat().st_size:
                 raise InputError(

@@ -13,6 +13,7 @@ import numpy as np
 from .camera_fields import calibration
 from .cameras import Camera, located
 from .errors import InputError
+from .files import check_regular
 
 FILE_NAME = "poses_bounds.npy"
 COLUMNS = 17
@@ -47,8 +48,11 @@ def _camera(name: str, row: np.ndarray) -> Camera:
 def _rows(path: Path) -> np.ndarray:
     """The array [photographs, 17], float64."""
     try:
+        check_regular(path)
         # Mapped, so that a header that promises more than there is costs no memory.
         rows = np.load(path, mmap_mode="r", allow_pickle=False)
+    except InputError:
+        raise
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error}); expected LLFF's {FILE_NAME}") from None
     except Exception as error:  # a damaged header raises many kinds

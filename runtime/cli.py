@@ -1,11 +1,12 @@
 """The command idesplat-infer: photographs and cameras to a splat file, depth maps and views."""
 
 import json
+import os
 import shlex
 import time
-from collections import Counter
+from contextlib import suppress
 from dataclasses import asdict, replace
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -13,11 +14,13 @@ import typer
 from .camera_format import ESTIMATE, CameraFormat
 from .depth_format import DepthFormat
 from .errors import InputError, exit_on_input_error
-from .files import check_writable, make_folder, replacing
+from .outputs import STANDARD_OUTPUT, Overwrite, guards_outputs, name_files, outputs, write_json
+from .terminal import run, say
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from .cameras import Camera
     from .cleaning import Cleaning
     from .depth_range import DepthRange
     from .inputs import Inputs, Request
@@ -28,8 +31,11 @@ if TYPE_CHECKING:
 PATH_FRAMES = 24
 # How many pixels COLMAP's fusion asks of a point unless told otherwise.
 COLMAP_MIN_PIXELS = 5
+DEPTH_ENDINGS = (".png", ".npz")  # of a depth map to look at, and of a metric one
 # What the folder's name ends in where a model that predicts depth alone is not told where to.
 DEPTH_FOLDER = "-depth"
+# Beside the scene, the cameras that were estimated for it.
+ESTIMATED_CAMERAS = ".cameras.json"
 OUT_HELP = (
     "Splats: .ply, .compressed.ply, .splat, .spz, .sog, .glb. Points: .points.ply, .points.glb, .xyz, .obj. "
     "Surfaces: .mesh.ply, .mesh.glb, .mesh.obj."
@@ -38,6 +44,7 @@ CLEANING = "Cleaning (off unless asked for)"
 
 
 @exit_on_input_error
+@guards_outputs("idesplat-infer")
 def infer(
     images: Annotated[
         list[Path], typer.Option(help="Folder, glob or files of photographs, or a video.", show_default=False)
@@ -67,7 +74,7 @@ def infer(
         typer.Option(help="How many photographs to use, the best placed ones: 2, or all --frames.", min=2),
     ] = None,
     frames: Annotated[
-        str | None, typer.Option(help="Photographs to use: names or numbers from 0, with commas between.")
+        str | None, typer.Option(help="Photographs to use: names, numbers from 0, 0-3 or 0:8:2, with commas between.")
     ] = None,
     size: Annotated[str | None, typer.Option(help="HEIGHTxWIDTH to work at instead of the trained size.")] = None,
     near: Annotated[float | None, typer.Option(help="Nearest depth in scene units, else found.")] = None,
@@ -113,13 +120,20 @@ def infer(
         ),
     ] = False,
     save_cameras: Annotated[
-        Path | None, typer.Option(help="Write the photographs' cameras: our own JSON, or transforms.json if named so.")
+        Path | None,
+        typer.Option(
+            help="Write the photographs' cameras: our own JSON, or transforms.json if named so. Estimated ones are "
+            "kept in any case, beside the scene."
+        ),
     ] = None,
     report: Annotated[
         Path | None, typer.Option(help="Write one .html that shows views, depth, confidence, timings and settings.")
     ] = None,
     timings: Annotated[bool, typer.Option("--timings", help="Print seconds by stage.")] = False,
-    json_path: Annotated[Path | None, typer.Option("--json", help="Write a summary as JSON.")] = None,
+    json_path: Annotated[
+        Path | None, typer.Option("--json", help="Write a summary as JSON, to standard output if it is -.")
+    ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Turn posed photographs into a 3D Gaussian splat that every viewer opens."""
     from .cameras import write_cameras
@@ -131,18 +145,25 @@ def infer(
     from .runner import Runner
 
     started = time.perf_counter()
-    _check_outputs(out, (json_path, save_cameras, report), (save_depth, render))
+    given = Request([*images, *(more_images or [])], cameras, camera_format, focal, frames, views, size)
+    if cameras == ESTIMATE and save_cameras is None:
+        save_cameras = _beside(out, ESTIMATED_CAMERAS)
+    model = model or default_model()
+    files = {"--out": out, "--json": json_path, "--save-cameras": save_cameras, "--report": report}
+    _announce(given, model, files, {"--save-depth": save_depth, "--render": render})
     _check_range(near, far)
     _check_offset(offset)
     cleaning = Cleaning(min_opacity, trim_border, trim_edges, min_confidence, merge_duplicates)
-    given = Request([*images, *(more_images or [])], cameras, camera_format, focal, frames, views, size)
     with working("loading the model"):
-        runner = Runner(model or default_model(), provider)
+        runner = Runner(model, provider)
     _check_fit(runner, out, cleaning, {"--render": render, "--report": report})
     _check_depth_format(depth_format, save_depth, runner)
     preparing = time.perf_counter()
     inputs = read_inputs(given, runner)
     prepared = inputs.views
+    if not runner.description.gaussians and save_depth is None:  # depth maps are what such a model is for
+        save_depth = _beside(out, DEPTH_FOLDER)
+    _announce_pictures(given, inputs, save_depth, depth_format, render)
     with working("finding near and far"):
         span = runner.depth_range(prepared, near, far)
     prepared, place_notes = _place(prepared, offset, span)
@@ -153,12 +174,11 @@ def infer(
     if cleaning.asked and not is_surface(out):
         prediction, cleaned = _clean(prediction, prepared, cleaning)
     _write_scene(prediction, prepared, out, cleaning)
-    if prediction.gaussians is None and save_depth is None:  # depth maps are what such a model is for
-        save_depth = make_folder(out.with_name(out.name.partition(".")[0] + DEPTH_FOLDER))
     pictures = _write_pictures(prediction, prepared, save_depth, depth_format, render)
     written = [out]
     if save_cameras is not None:
-        write_cameras(save_cameras, inputs.cameras)
+        found = inputs.cameras
+        write_cameras(save_cameras, _named_from(save_cameras.parent, found) if cameras == ESTIMATE else found)
         written.append(save_cameras)
     seconds = {"load": runner.load_seconds, "prepare": predicting - preparing, **prediction.seconds}
     seconds |= {"write": time.perf_counter() - writing, "total": time.perf_counter() - started}
@@ -172,28 +192,28 @@ def infer(
         written.append(report)
         summary["files"].append(str(report))
     if json_path is not None:
-        with replacing(json_path) as temporary:
-            temporary.write_text(json.dumps(summary, indent=2) + "\n")
-        written.append(json_path)
+        write_json(json_path, json.dumps(summary, indent=2))
+        if json_path != STANDARD_OUTPUT:
+            written.append(json_path)
     for note in [*inputs.notes, *place_notes]:
-        print(note)
-    print(f"near {span.near:.4g} and far {span.far:.4g}, in the cameras' unit: {span.source}")
+        say(note)
+    say(f"near {span.near:.4g} and far {span.far:.4g}, in the cameras' unit: {span.source}")
     for path in written:
-        print(f"wrote {path}")
+        say(f"wrote {path}{_described(path, prediction, seconds) if path == out else ''}")
     _say_pictures(len(prepared.names), save_depth, depth_format, render)
     if prediction.gaussians is not None and holds_splats(out):
         _say_how_to_look(out, given, save_cameras)
     else:
-        print(f"open {out} in MeshLab, CloudCompare or Blender")
+        say(f"open {out} in MeshLab, CloudCompare or Blender")
     if report is not None:
-        print(f"open {report} in any browser")
+        say(f"open {report} in any browser")
     if timings:
         _print_timings(seconds)
 
 
 def main() -> None:
     """Entry point of idesplat-infer."""
-    typer.run(infer)
+    run(infer)
 
 
 def _say_pictures(views: int, save_depth: Path | None, depth_format: DepthFormat | None, render: Path | None) -> None:
@@ -202,45 +222,114 @@ def _say_pictures(views: int, save_depth: Path | None, depth_format: DepthFormat
         fuse += ["--output_path", str(save_depth / "fused.ply")]
         if views < COLMAP_MIN_PIXELS:
             fuse += ["--StereoFusion.min_num_pixels", str(views)]
-        print(
+        say(
             f"wrote {save_depth}: {views} depth maps as a dense workspace of COLMAP; to make one cloud of points of it:"
         )
-        print("    " + shlex.join(fuse))
+        say("    " + shlex.join(fuse))
     elif save_depth is not None:
-        print(f"wrote {save_depth}: {views} depth maps, as .png to look at and as .npz in the cameras' unit")
+        say(f"wrote {save_depth}: {views} depth maps, as .png to look at and as .npz in the cameras' unit")
     if render is not None:
-        print(f"wrote {render}: {views} views and {PATH_FRAMES} frames of a path through them, as .png")
+        say(f"wrote {render}: {views} views and {PATH_FRAMES} frames of a path through them, as .png")
 
 
 def _say_how_to_look(out: Path, given: "Request", save_cameras: Path | None) -> None:
-    """Commands to copy. Cameras that were found are of use only where they were kept."""
-    cameras: list[str] = []
-    if given.cameras != ESTIMATE:
+    """Commands to copy, with the cameras that were given, or those that were found and kept."""
+    if given.cameras == ESTIMATE:
+        cameras = ["--cameras", str(save_cameras)]
+    else:
         form = ["--camera-format", given.camera_format] if given.camera_format else []
         cameras = ["--cameras", given.cameras, *form]
-    elif save_cameras is not None:
-        cameras = ["--cameras", str(save_cameras)]
-    photographs = ["--images", str(given.images[0])] if cameras and len(given.images) == 1 else []
-    print(f"open {out} in any splat viewer (SuperSplat, for one), look at it in the browser, or draw it:")
-    print("    " + shlex.join(["idesplat-view", str(out), *cameras, *photographs]))
-    print("    " + shlex.join(["idesplat-render", str(out), *cameras, "--out"]) + " DIR")
-    if not cameras:
-        print("    (--save-cameras FILE.json keeps the cameras that were found, to be given here as --cameras)")
+    photographs = ["--images", str(given.images[0])] if len(given.images) == 1 else []
+    say(f"open {out} in any splat viewer (SuperSplat, for one), look at it in the browser, or draw it:")
+    say("    " + shlex.join(["idesplat-view", str(out), *cameras, *photographs]))
+    say("    " + shlex.join(["idesplat-render", str(out), *cameras, "--out"]) + " DIR")
 
 
-def _check_outputs(out: Path, files: "Sequence[Path | None]", folders: "Sequence[Path | None]") -> None:
-    """Find out before the work whether the results can be written."""
+def _beside(out: Path, ending: str) -> Path:
+    """A path beside the scene, called like it but for the ending."""
     from .formats import scene_suffix
 
-    scene_suffix(out)
-    for path in (out, *files):
-        if path is not None:
-            if path.is_dir():
-                raise InputError(f"{path}: is a folder, expected a file to write")
-            check_writable(path.parent)
-    for folder in folders:
+    return out.with_name(out.name[: -len(scene_suffix(out))] + ending)
+
+
+def _announce(
+    given: "Request", model: Path, files: "dict[str, Path | None]", folders: "dict[str, Path | None]"
+) -> None:
+    """Say, before the work, what is read and what is to be written; raises InputError where that does not go together.
+
+    files, folders: what is to be written, by option.
+    """
+    from .formats import scene_suffix
+    from .input_files import camera_files, given_images, model_files
+
+    run = outputs()
+    run.reads("the model", model_files(model))
+    run.reads("a photograph", given_images(given.images))
+    if given.cameras != ESTIMATE:
+        run.reads("the cameras", camera_files(Path(given.cameras)))
+    if files["--out"] is not None:
+        scene_suffix(files["--out"])
+    for option, path in files.items():
+        if path is not None and not (option == "--json" and path == STANDARD_OUTPUT):
+            run.writes(option, [path])
+    for option, folder in folders.items():
         if folder is not None:
-            check_writable(make_folder(folder))
+            run.writes_into(option, folder)
+
+
+def _announce_pictures(
+    given: "Request",
+    inputs: "Inputs",
+    save_depth: Path | None,
+    depth_format: DepthFormat | None,
+    render: Path | None,
+) -> None:
+    """Say what is written into folders, now that the views are chosen; raises InputError as `_announce`."""
+    from .input_files import named_images
+
+    run, stems = outputs(), _stems(inputs.views)
+    if given.cameras != ESTIMATE:
+        run.reads("a photograph", named_images(Path(given.cameras), inputs.cameras))
+    if save_depth is not None:
+        run.writes("--save-depth", _depth_paths(save_depth, stems, depth_format))
+    if render is not None:
+        run.writes("--render", [render / name for name in (*map(_view_name, stems), *_path_names())])
+
+
+def _stems(views: "Views") -> list[str]:
+    """What the files that are made of the views are called, but for their endings."""
+    return name_files([camera.name for camera in views.cameras])
+
+
+def _view_name(stem: str) -> str:
+    return f"view-{stem}.png"
+
+
+def _path_names() -> list[str]:
+    """The frames of the path through the views."""
+    return [f"path-{index:03d}.png" for index in range(PATH_FRAMES)]
+
+
+def _named_from(folder: Path, cameras: "Sequence[Camera]") -> "list[Camera]":
+    """The cameras, their images named as seen from a folder, where they are files; a frame of a video is none."""
+    named = []
+    for camera in cameras:
+        if Path(camera.name).is_file():
+            name = os.path.realpath(camera.name)
+            with suppress(ValueError):  # on another drive of Windows
+                name = os.path.relpath(name, os.path.realpath(folder))
+            camera = replace(camera, name=Path(name).as_posix())
+        named.append(camera)
+    return named
+
+
+def _described(out: Path, prediction: "Prediction", seconds: dict[str, float]) -> str:
+    """What the file of the scene holds, how large it is and how long it took, as the end of a line."""
+    from .formats import holds_splats
+
+    splats = prediction.gaussians if holds_splats(out) else None
+    count = "" if splats is None else f"{len(splats):,} Gaussians, "
+    return f": {count}{out.stat().st_size / 1e6:.1f} MB, in {seconds['total']:.1f} s"
 
 
 def _check_fit(runner: "Runner", out: Path, cleaning: "Cleaning", drawn: dict[str, Path | None]) -> None:
@@ -303,7 +392,7 @@ def _clean(prediction: "Prediction", views: "Views", cleaning: "Cleaning") -> "t
 
     whole = prediction.need_gaussians()
     gaussians, taken = clean(whole, prediction.depth, views.extrinsics, views.intrinsics, cleaning)
-    print(describe(taken, len(gaussians)))
+    say(describe(taken, len(gaussians)))
     return replace(prediction, gaussians=gaussians), taken
 
 
@@ -315,10 +404,10 @@ def _write_scene(prediction: "Prediction", views: "Views", out: Path, cleaning: 
 
     if not is_surface(out) and prediction.gaussians is not None:
         for note in write_scene(out, prediction.gaussians, views.offset):
-            print(f"note: {note}")
+            say(f"note: {note}")
         return
     for note in lost_offset(views.offset):
-        print(f"note: {note}")
+        say(f"note: {note}")
     points = points_from_depth(prediction.depth, views.images, views.extrinsics, views.intrinsics)
     if is_surface(out):
         write_mesh(out, points, faces_from_depth(prediction.depth, cleaning.trim_edges or LARGEST_JUMP))
@@ -334,7 +423,7 @@ def _write_pictures(
     render: Path | None,
 ) -> list[Path]:
     """Write depth maps and drawn views, where asked for; the paths written."""
-    stems = _stems(views.names)
+    stems = _stems(views)
     written = []
     if save_depth is not None:
         written += _write_depth(prediction, views, stems, save_depth, depth_format)
@@ -343,11 +432,13 @@ def _write_pictures(
     return written
 
 
-def _stems(names: list[str]) -> list[str]:
-    """File names without suffix, with the view's number in front where two are the same."""
-    stems = [PurePath(name).stem for name in names]
-    counts = Counter(stems)
-    return [stem if counts[stem] == 1 else f"{index}-{stem}" for index, stem in enumerate(stems)]
+def _depth_paths(folder: Path, stems: list[str], depth_format: DepthFormat | None) -> list[Path]:
+    """What `_write_depth` writes."""
+    from .colmap_workspace import workspace_paths
+
+    if depth_format is DepthFormat.COLMAP:
+        return workspace_paths(folder, stems)
+    return [folder / (stem + ending) for stem in stems for ending in DEPTH_ENDINGS]
 
 
 def _write_depth(
@@ -373,9 +464,9 @@ def _write_renders(prediction: "Prediction", views: "Views", stems: list[str], f
     gaussians = prediction.need_gaussians()
     height, width = prediction.depth.shape[1:]
     K = views.intrinsics.astype(np.float64) * np.array([width, height, 1.0])[:, None]  # [views, 3, 3]
-    shots = [(f"view-{stem}.png", pose, k) for stem, pose, k in zip(stems, views.extrinsics, K, strict=True)]
+    shots = [(_view_name(stem), pose, k) for stem, pose, k in zip(stems, views.extrinsics, K, strict=True)]
     path = interpolate_extrinsics(views.extrinsics, PATH_FRAMES)
-    shots += [(f"path-{index:03d}.png", pose, K.mean(axis=0)) for index, pose in enumerate(path)]
+    shots += [(name, pose, K.mean(axis=0)) for name, pose in zip(_path_names(), path, strict=True)]
     written = []
     for name, pose, k in progress(shots, "drawing views"):
         save_png(folder / name, draw_view(gaussians, pose, k, width, height).rgb)
@@ -414,4 +505,4 @@ def _summary(
 
 def _print_timings(seconds: dict[str, float]) -> None:
     for name, value in seconds.items():
-        print(f"{name:>10} {value:8.2f} s")
+        say(f"{name:>10} {value:8.2f} s")

@@ -31,6 +31,7 @@ FEWEST_SIGHTS = 2  # of a point
 SOURCES = "__auto__, 20"  # COLMAP's own choice of the images to match with
 GEOMETRIC = ".geometric.bin"
 OFFSET_FILE = "offset.txt"
+CONFIGURATIONS = ("fusion.cfg", "patch-match.cfg")  # in stereo/
 
 
 def write_workspace(folder: Path, stems: Sequence[str], prediction: Prediction, views: Views) -> list[Path]:
@@ -61,6 +62,15 @@ def write_workspace(folder: Path, stems: Sequence[str], prediction: Prediction, 
         with replacing(path) as temporary:
             temporary.write_text(text)
     return [*written, *texts]
+
+
+def workspace_paths(folder: Path, stems: Sequence[str]) -> list[Path]:
+    """The files that a workspace consists of, but for `offset.txt`."""
+    names = [f"{stem}.png" for stem in stems]
+    stereo = folder / "stereo"
+    maps = [stereo / kind / (name + GEOMETRIC) for kind in ("depth_maps", "normal_maps") for name in names]
+    sparse = [folder / "sparse" / name for name in ("cameras.bin", "images.bin", "points3D.bin")]
+    return [*(folder / "images" / name for name in names), *maps, *sparse, *(stereo / name for name in CONFIGURATIONS)]
 
 
 def normals_of(depth: np.ndarray, K: np.ndarray) -> np.ndarray:

@@ -9,6 +9,8 @@ import typer
 
 from .camera_format import CameraFormat
 from .errors import InputError, exit_on_input_error
+from .outputs import Overwrite, guards_outputs, outputs
+from .terminal import run, say
 
 if TYPE_CHECKING:
     from .cameras import Camera
@@ -23,6 +25,7 @@ def _commands() -> None:
 
 @app.command()
 @exit_on_input_error
+@guards_outputs("idesplat-cameras")
 def convert(
     cameras: Annotated[Path, typer.Argument(help="File or folder of cameras of any known format.", show_default=False)],
     out: Annotated[
@@ -37,25 +40,28 @@ def convert(
     camera_format: Annotated[
         CameraFormat | None, typer.Option(help="Format of the cameras, where their content does not tell it.")
     ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Read cameras and write them as JSON, camera-to-world with OpenCV axes, pixels with centres at .5."""
     from .cameras import read_cameras, recognise, write_cameras
     from .images import find_images
+    from .input_files import camera_files, given_images
 
     if out.suffix != ".json":
         raise InputError(f"{out}: expected a file that ends in .json")
-    if out.resolve() == cameras.resolve():
-        raise InputError(f"{out}: would replace the cameras that it is made from; choose another name")
     pictures = [*(images or []), *(more_images or [])]
+    outputs().reads("the cameras", camera_files(cameras))
+    outputs().reads("a photograph", given_images(pictures))
+    outputs().writes("", [out])
     found = read_cameras(cameras, find_images(pictures) if pictures else (), camera_format)
     write_cameras(out, found)
-    print(f"read {len(found)} cameras as {camera_format or recognise(cameras)}: {_lenses(found)}")
-    print(f"wrote {out}")
+    say(f"read {len(found)} cameras as {camera_format or recognise(cameras)}: {_lenses(found)}")
+    say(f"wrote {out}")
 
 
 def main() -> None:
     """Entry point of idesplat-cameras."""
-    app()
+    run(app)
 
 
 def _lenses(cameras: "Sequence[Camera]") -> str:

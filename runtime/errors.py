@@ -1,20 +1,33 @@
-"""The one exception that stands for "your input, not our code", and the exit status that goes with it.
+"""The one exception that stands for "your input, not our code", and how a command ends.
 
 Every message is one line that says what is wrong, where, what was expected and what to do. The commands
 print it without a traceback and exit with `EXIT_STATUS`; library users catch `InputError`.
 """
 
+import contextlib
 import functools
+import signal
 import sys
+import unicodedata
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
 EXIT_STATUS = 2
+SIGNALLED = 128  # a shell's exit status of a command that a signal ended is this and the signal's number
+BROKEN_PIPE = SIGNALLED + 13  # SIGPIPE, which Windows does not name
 
 
 class InputError(ValueError):
     """Something the user gave cannot be used: a file, a camera, an option."""
+
+
+class Terminated(KeyboardInterrupt):
+    """A signal that asks the process to end: it cleans up as after Ctrl-C."""
+
+    def __init__(self, signal_number: int) -> None:
+        super().__init__()
+        self.signal_number = signal_number
 
 
 def refuse(path: Path, what: str, remedy: str) -> NoReturn:
@@ -22,16 +35,50 @@ def refuse(path: Path, what: str, remedy: str) -> NoReturn:
     raise InputError(f"{path}: {what}; {remedy}")
 
 
+def printable(text: str) -> str:
+    """The text with control characters, bidirectional overrides and lone surrogates as escapes, such as \\x1b.
+
+    Names of files and cameras may hold them, and a terminal would obey them. Line breaks and tabs are escaped, too.
+    """
+    return "".join(character if _is_shown(character) else _escape(character) for character in text)
+
+
+def report_error(message: str) -> None:
+    """Print an error as one line on stderr, where that can be written."""
+    with contextlib.suppress(OSError):
+        print(f"error: {printable(' '.join(message.split()))}", file=sys.stderr)
+
+
 def exit_on_input_error(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Make a command print an `InputError` as one line on stderr and exit with status 2."""
+    """Make a command print an `InputError` as one line on stderr and exit with status 2.
+
+    The same goes for what the system refuses, and for too little memory. A signal ends it as shells expect.
+    """
 
     @functools.wraps(command)
     def wrapped(*args: Any, **kwargs: Any) -> Any:
         try:
             return command(*args, **kwargs)
         except InputError as error:
-            message = " ".join(str(error).split())
-            print(f"error: {message}", file=sys.stderr)
-            raise SystemExit(EXIT_STATUS) from None
+            report_error(str(error))
+        except MemoryError:
+            report_error("memory ran out; give a smaller file, fewer or smaller images, or use a larger machine")
+        except BrokenPipeError:  # whoever read the output has seen enough
+            raise SystemExit(BROKEN_PIPE) from None
+        except OSError as error:
+            if error.strerror is None:  # not the system's
+                raise
+            report_error(f"{error.filename}: {error.strerror}" if error.filename else error.strerror)
+        except KeyboardInterrupt as interrupt:
+            raise SystemExit(SIGNALLED + getattr(interrupt, "signal_number", signal.SIGINT)) from None
+        raise SystemExit(EXIT_STATUS)
 
     return wrapped
+
+
+def _is_shown(character: str) -> bool:
+    return character.isprintable() or unicodedata.category(character) == "Zs"  # spaces of all widths
+
+
+def _escape(character: str) -> str:
+    return character.encode("unicode_escape").decode("ascii")

@@ -3,7 +3,7 @@
 To add a format, write one file with a writer and a reader, and one line here.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -103,21 +103,27 @@ def read_offset(path: Path) -> np.ndarray:
 
 def read_scene(path: Path) -> Gaussians:
     """Read Gaussians from a file in any of the formats; raises InputError if that is not possible."""
-    suffix = scene_suffix(path)
+    suffix, expected = _ending(path, (*FORMATS, *POINTS, *MESHES)), ", ".join(FORMATS)
+    if suffix is None:
+        raise InputError(f"{path}: expected a splat file, whose name ends in {expected}")
     if suffix not in FORMATS:
-        raise InputError(
-            f"{path}: points and surfaces hold no Gaussians; give a file that ends in {', '.join(FORMATS)}"
-        )
+        raise InputError(f"{path}: points and surfaces hold no Gaussians; give a file that ends in {expected}")
     return FORMATS[suffix].read(Path(path))
 
 
 def scene_suffix(path: Path) -> str:
     """The longest ending of a file's name that stands for a format; raises InputError if there is none."""
-    name, known = Path(path).name.lower(), (*FORMATS, *POINTS, *MESHES)
-    endings = [suffix for suffix in known if name.endswith(suffix)]
-    if not endings:
+    known = (*FORMATS, *POINTS, *MESHES)
+    suffix = _ending(path, known)
+    if suffix is None:
         raise InputError(f"{path}: expected a file name that ends in {', '.join(known)}")
-    return max(endings, key=len)
+    return suffix
+
+
+def _ending(path: Path, known: Sequence[str]) -> str | None:
+    """The longest of these endings that a file's name has, in whatever case."""
+    name = Path(path).name.lower()
+    return max((suffix for suffix in known if name.endswith(suffix)), key=len, default=None)
 
 
 def holds_splats(path: Path) -> bool:

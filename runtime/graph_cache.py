@@ -9,7 +9,7 @@ import hashlib
 import json
 import os
 import platform
-import tempfile
+import stat
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -17,6 +17,9 @@ from pathlib import Path
 from typing import TypeVar
 
 import onnxruntime
+
+from .files import collect_abandoned, open_regular, scratch_folder
+from .user_cache import cache_folder
 
 LAYOUT = 1
 SUFFIX = ".onnx"
@@ -43,7 +46,7 @@ class Place:
         """The optimised graph, if it is there and intact; what is there and is not, is removed."""
         for path in self.folder.glob(f"{self.key}.*{SUFFIX}"):
             with suppress(OSError):
-                if path.name == self._name(path):
+                if _is_regular(path) and path.name == self._name(path):
                     _touch(path)
                     return path
                 path.unlink()
@@ -54,14 +57,10 @@ class Place:
 
         Raises OSError where the folder cannot be written, and what `make` raises.
         """
-        handle, name = tempfile.mkstemp(suffix=SUFFIX, dir=self.folder)
-        os.close(handle)
-        temporary = Path(name)
-        try:
+        with scratch_folder(self.folder) as scratch:
+            temporary = scratch / f"graph{SUFFIX}"
             result = make(temporary)
             path = temporary.replace(self.folder / self._name(temporary))
-        finally:
-            temporary.unlink(missing_ok=True)
         _shrink(self.folder, path)
         return result
 
@@ -73,20 +72,22 @@ class Place:
     def _name(self, path: Path) -> str:
         """The name that an entry with the content of `path` has here and nowhere else."""
         digest = hashlib.sha256(self.key.encode())
-        digest.update(path.read_bytes())
+        with open_regular(path) as file:
+            digest.update(file.read())
         return f"{self.key}.{digest.hexdigest()}{SUFFIX}"
 
 
 def place_for(model: Path) -> Place | None:
     """Where the optimised graph of a model file belongs; None where it is not to be, or cannot be, kept."""
     try:
-        if model.stat().st_size > LARGEST_MODEL:
+        if not _is_regular(model) or model.stat().st_size > LARGEST_MODEL:
             return None
         content = model.read_bytes()
         if EXTERNAL in content:  # those files' content would have to be part of the key
             return None
-        folder = _folder()
+        folder = cache_folder("graphs")
         folder.mkdir(parents=True, exist_ok=True)
+        collect_abandoned(folder)
     except (OSError, RuntimeError):  # RuntimeError: there is no home folder
         return None
     made_for = [LAYOUT, onnxruntime.__version__, onnxruntime.get_build_info(), _processor()]
@@ -95,10 +96,9 @@ def place_for(model: Path) -> Place | None:
     return Place(folder, digest.hexdigest()[:KEY_LENGTH])
 
 
-def _folder() -> Path:
-    """Ours in the user's cache folder."""
-    given = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
-    return (Path(given) if given else Path.home() / ".cache") / "idesplat" / "graphs"
+def _is_regular(path: Path) -> bool:
+    """Whether it can be read to its end: a named pipe cannot."""
+    return stat.S_ISREG(path.stat().st_mode)
 
 
 def _processor() -> str:

@@ -1,6 +1,6 @@
 """What idesplat-infer is given, brought together: photographs or a video, their cameras or none, views and size."""
 
-import tempfile
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -8,6 +8,7 @@ from pathlib import Path
 from .camera_format import ESTIMATE, CameraFormat
 from .cameras import Camera, read_cameras
 from .errors import InputError
+from .files import scratch_folder
 from .images import cover, stem
 from .photographs import find_photographs
 from .progress import working
@@ -17,6 +18,9 @@ from .view_choice import FEWEST_VIEWS
 from .views import Views, match, prepare
 
 DEFAULT_VIEWS = 2
+# What --frames takes beside names and numbers: 0-3 is 0, 1, 2, 3; 0:8:2 is 0, 2, 4, 6, as Python has it.
+RANGE = re.compile(r"([0-9]{1,9})(?:-([0-9]{1,9}))?")
+SLICE = re.compile(r"([0-9]{0,9}):([0-9]{0,9})(?::([0-9]{0,9}))?")
 MUCH = 0.7  # share of a photograph below which it is said that the rest is cut off
 
 
@@ -50,9 +54,9 @@ def read_inputs(request: Request, runner: Runner) -> Inputs:
 
     Raises InputError for whatever cannot be used.
     """
-    with tempfile.TemporaryDirectory() as folder:
+    with scratch_folder() as folder:
         given = None if request.cameras == ESTIMATE else Path(request.cameras)
-        images = find_photographs(request.images, given, request.camera_format, Path(folder))
+        images = find_photographs(request.images, given, request.camera_format, folder)
         notes = []
         if given is None:
             from .estimate import estimate_cameras
@@ -70,7 +74,7 @@ def read_inputs(request: Request, runner: Runner) -> Inputs:
         pairs = match(images, cameras)
         if request.frames is None and len(cameras) > len(pairs):
             notes.append(f"{len(cameras) - len(pairs)} of {len(cameras)} cameras have no photograph among those given")
-        own = [camera if path.parent != Path(folder) else replace(camera, name=path.name) for path, camera in pairs]
+        own = [camera if path.parent != folder else replace(camera, name=path.name) for path, camera in pairs]
         height, width = parse_size(request.size) if request.size else runner.size_for(own)
         count = min(wanted or len(pairs), len(pairs))
         runner.check_size(max(count, FEWEST_VIEWS), height, width)
@@ -90,6 +94,7 @@ def read_inputs(request: Request, runner: Runner) -> Inputs:
 def pick_frames(images: Sequence[Path], frames: str | None) -> list[Path]:
     """The images that --frames names, in its order: names with or without suffix, or numbers counted from 0.
 
+    Ranges of numbers are first-last, and start:stop:step without the stop. What is the name of an image is that image.
     Raises InputError for what is none of the images.
     """
     if frames is None:
@@ -97,18 +102,30 @@ def pick_frames(images: Sequence[Path], frames: str | None) -> list[Path]:
     picked = []
     for word in (word.strip() for word in frames.split(",")):
         named = [image for image in images if word in (image.name, stem(image))]
-        if not named and word.isdecimal() and int(word) < len(images):
-            named = [images[int(word)]]
-        if len(named) != 1:
+        chosen = named or [images[number] for number in _numbers(word, len(images))]
+        if len(named) > 1 or not chosen:
             problem = f"{len(named)} of the {len(images)} images are called so" if named else "no image is called so"
             raise InputError(
                 f"--frames {word}: {problem}; expected names such as {images[0].name}, or numbers from 0 to "
-                f"{len(images) - 1}, with commas between"
+                f"{len(images) - 1}, also as 0-3 or 0:8:2, with commas between"
             )
-        picked += named
+        picked += chosen
     if len(set(picked)) < len(picked):
         raise InputError(f"--frames {frames}: names an image twice, expected each once")
     return picked
+
+
+def _numbers(word: str, count: int) -> Sequence[int]:
+    """The numbers below `count` that a number, a range or a slice stands for; none where one of them is not."""
+    if found := RANGE.fullmatch(word):
+        first = int(found[1])
+        numbers = range(first, int(found[2] or first) + 1)
+    elif found := SLICE.fullmatch(word):
+        start, stop, step = (int(part) if part else None for part in found.groups())
+        numbers = range(start or 0, count if stop is None else stop, step or 1) if step != 0 else range(0)
+    else:
+        return []
+    return numbers if numbers and numbers[-1] < count else []
 
 
 def _wanted(request: Request, runner: Runner, picked: Sequence[Path]) -> int | None:
@@ -133,5 +150,12 @@ def _estimated(photographs: int, cameras: Sequence[Camera]) -> str:
     left = f", {photographs - len(cameras)} could not be placed" if len(cameras) < photographs else ""
     return (
         f"cameras of {len(cameras)} photographs estimated by {by}{left}; the first is the world's origin, and the unit "
-        "is the median depth of what they see, since photographs do not know their scale"
+        f"is the median depth of what they see, since photographs do not know their scale; {_focal_lengths(cameras)}"
     )
+
+
+def _focal_lengths(cameras: Sequence[Camera]) -> str:
+    focals = sorted(float(camera.K[0, 0]) for camera in cameras)
+    span = dict.fromkeys(f"{focal:.0f}" for focal in (focals[0], focals[-1]))
+    first = cameras[0]
+    return f"focal length {' to '.join(span)} pixels, of photographs {first.width} wide and {first.height} high"

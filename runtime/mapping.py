@@ -1,7 +1,6 @@
 """More than two photographs without cameras: our features and matches, COLMAP's mapper (pycolmap, extra `colmap`)."""
 
 import importlib.util
-import tempfile
 from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 from .cameras import Camera
 from .cameras_colmap import INSTALL, describe, observed_depths, to_camera
 from .errors import InputError
+from .files import scratch_folder
 from .matching import match_features
 from .progress import progress, working
 
@@ -46,8 +46,8 @@ def place_photographs(photographs: "Sequence[Photograph]", refine_focal: bool) -
     import pycolmap
 
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
-    with tempfile.TemporaryDirectory() as folder:
-        database_path = Path(folder) / "database.db"
+    with scratch_folder() as folder:
+        database_path = folder / "database.db"
         _fill(database_path, photographs)
         with working("placing photographs"):
             pycolmap.geometric_verification(database_path)

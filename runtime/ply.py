@@ -14,7 +14,7 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 
 from .errors import InputError, refuse
-from .files import replacing
+from .files import open_regular, replacing
 from .gaussians import Gaussians, check_ranges
 from .ply_header import LIST, Element, offset_comment, read_header
 
@@ -60,7 +60,7 @@ def read_ply(path: Path) -> Gaussians:
     """
     path = Path(path)
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             vertices = _find_vertices(file, path)
             return _read_vertices(file, path, vertices)
     except OSError as error:

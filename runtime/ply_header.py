@@ -6,6 +6,7 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 
 from .errors import InputError, refuse
+from .files import open_regular
 
 MAX_HEADER_BYTES = 1 << 20
 MAGIC = b"ply"
@@ -86,7 +87,7 @@ def _add_property(element: Element, name: str, number_type: str, path: Path) -> 
 def has_element(path: Path, name: str) -> bool:
     """Whether a file's header announces this element; raises InputError if it is no .ply that can be read."""
     try:
-        with Path(path).open("rb") as file:
+        with open_regular(path) as file:
             return any(element.name == name for element in read_header(file, path)[0])
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}; expected a splat file (.ply)") from None

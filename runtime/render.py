@@ -2,25 +2,29 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import typer
 
 from .cameras import Camera, CameraFormat, read_cameras, relative_cameras
-from .drawing import BLACK, draw_view
+from .drawing import draw_view
 from .errors import InputError, exit_on_input_error
-from .files import check_writable, make_folder, replacing
+from .files import replacing
 from .formats import read_offset, read_scene
 from .gaussians import Gaussians
 from .images_out import depth_colours, depth_ends, save_png
+from .input_files import camera_files, named_images, nearby_images
+from .outputs import Overwrite, guards_outputs, name_files, outputs
 from .progress import progress
 from .rasterizer import Rendering
-from .shots import FULL_TURN, SWING, along_path, around, fitted, overview
+from .shots import FULL_TURN, MOST_FRAMES, STILL, SWING, along_path, around, check_shots, fitted, frame_names, overview
 from .sizes import parse_size
-from .video_out import open_video
+from .terminal import run, say
+from .video_out import check_video_support, open_video
 
+COMMAND = "idesplat-render"
 VIDEO, PICTURE = ".mp4", ".png"
 COLOUR, DEPTH, ALPHA = "", "-depth", "-alpha"  # what a picture shows, as its name ends
 SOLID = 0.5  # alpha from which on a pixel has a depth
@@ -29,6 +33,7 @@ MOST_LISTED = 12  # files that are named one by one
 
 
 @exit_on_input_error
+@guards_outputs(COMMAND)
 def render(
     scene: Annotated[Path, typer.Argument(help="Splat file of any format.", show_default=False)],
     out: Annotated[Path, typer.Option(help="Folder for pictures, one .png, or one .mp4.", show_default=False)],
@@ -41,7 +46,7 @@ def render(
     degrees: Annotated[
         float | None, typer.Option(help="Of the orbit: 360 by default, with cameras a swing of 30.", show_default=False)
     ] = None,
-    frames: Annotated[int, typer.Option(help="How many pictures --orbit and --path make.", min=1)] = 90,
+    frames: Annotated[int, typer.Option(help=f"How many pictures --orbit and --path make, 1 to {MOST_FRAMES}.")] = 90,
     fps: Annotated[float, typer.Option(help="Frames a second of an .mp4.")] = 30,
     size: Annotated[
         str | None, typer.Option(help=f"HEIGHTxWIDTH: the cameras' by default, or {SIZE}.", show_default=False)
@@ -49,52 +54,105 @@ def render(
     depth: Annotated[bool, typer.Option("--depth", help="Draw depth, too (colours, and metric .npz).")] = False,
     alpha: Annotated[bool, typer.Option("--alpha", help="Draw opacity, too.")] = False,
     background: Annotated[
-        tuple[float, float, float], typer.Option(help="Red, green and blue behind the scene, 0 to 1.")
-    ] = BLACK,
+        str, typer.Option(help="Red, green and blue behind the scene, 0 to 1, such as 1,1,1.", metavar="R,G,B")
+    ] = "0,0,0",
+    overwrite: Overwrite = False,
 ) -> None:
     """Draw a splat file as the cameras see it, on a path through them, in an orbit, or from where all of it is seen.
 
     Pictures are named after the cameras' images and have the cameras' own size. They show the ideal pinhole view: where
     a camera has lens distortion, compare with the undistorted photograph.
     """
-    if not all(0 <= value <= 1 for value in background):
-        raise InputError(f"--background is {background}, expected red, green and blue from 0 to 1")
+    colour = _parse_background(background)
     if not 0 < fps <= 1000:
         raise InputError(f"--fps {fps:g}: expected frames a second, 1 to 1000")
+    if not 1 <= frames <= MOST_FRAMES:
+        raise InputError(f"--frames {frames}: expected 1 to {MOST_FRAMES} pictures")
     _check_out(out)
     if path and orbit:
         raise InputError("--path and --orbit: expected one of them")
     views = read_cameras(cameras, form=camera_format) if cameras else []
     if path and not views:
         raise InputError("--path: needs the cameras that it leads through; give --cameras, or use --orbit")
+    kinds = [COLOUR, *[DEPTH] * depth, *[ALPHA] * alpha]
+    names = frame_names(frames) if path or orbit else [view.name for view in views] or [STILL]
+    stems = _stems(names, out, kinds)
+    _announce(scene, cameras, views, stems, out, kinds)
     gaussians = read_scene(scene)
     views = relative_cameras(views, read_offset(scene))
     shots = _shots(gaussians, views, orbit, path, degrees, frames, size)
-    kinds = [COLOUR, *[DEPTH] * depth, *[ALPHA] * alpha]
-    photographs = {(cameras.parent / _posix(view.name)).resolve(): view.name for view in views} if cameras else {}
-    draw = _drawer(gaussians, background)
+    check_shots(shots)
+    draw = _drawer(gaussians, colour)
     if out.suffix.lower() == VIDEO:
         written = _film(draw, shots, out, fps, kinds)
     else:
-        written = _pictures(draw, shots, out, kinds, photographs)
+        written = _pictures(draw, shots, stems, kinds)
     for file in written if len(written) <= MOST_LISTED else [f"{len(written)} files in {out}"]:
-        print(f"wrote {file}")
+        say(f"wrote {file}")
     pictures = "1 picture" if len(shots) == 1 else f"{len(shots)} pictures"
-    print(f"{len(gaussians):,} Gaussians drawn in {pictures}; open {out} in any {_viewer(out)}")
+    say(f"{len(gaussians):,} Gaussians drawn in {pictures}; open {out} in any {_viewer(out)}")
 
 
 def main() -> None:
     """Run the command."""
-    typer.run(render)
+    run(render)
 
 
 def _check_out(out: Path) -> None:
-    """Refuse the name of a kind of picture or video that is not made, which is hardly meant to be a folder."""
+    """Refuse what is not made: a kind of picture or video by its name, or any video where its library is missing."""
     from .images import SUFFIXES as PICTURES
     from .video import SUFFIXES as VIDEOS
 
     if out.suffix.lower() in {*PICTURES, *VIDEOS, ".gif"} - {PICTURE, VIDEO} and not out.is_dir():
         raise InputError(f"--out {out}: expected a folder, or a file that ends in {PICTURE} or {VIDEO}")
+    if out.suffix.lower() == VIDEO:
+        check_video_support()
+
+
+def _parse_background(text: str) -> tuple[float, float, float]:
+    """The option --background, `R,G,B` with numbers from 0 to 1; raises InputError."""
+    try:
+        red, green, blue = (float(part) for part in text.split(","))
+    except ValueError:
+        red = green = blue = float("nan")
+    if not all(0 <= value <= 1 for value in (red, green, blue)):
+        raise InputError(f"--background {text}: expected red, green and blue from 0 to 1, such as 1,1,1")
+    return red, green, blue
+
+
+def _announce(
+    scene: Path, cameras: Path | None, views: Sequence[Camera], stems: Sequence[Path], out: Path, kinds: Sequence[str]
+) -> None:
+    """Say what is read and what will be written, so that nothing is replaced that must not be; raises InputError.
+
+    The photographs are not read, but nothing may be drawn over them. What this command has drawn is none of them.
+    """
+    run = outputs()
+    run.reads("the scene", [scene])
+    if cameras is not None:
+        run.reads("the cameras", camera_files(cameras))
+        run.reads("a photograph", named_images(cameras, views))
+        nearby = nearby_images(cameras, views)
+        run.reads("a photograph", [image for image in nearby if run.writer_of(image) != COMMAND])
+    if out.suffix.lower() == VIDEO:
+        run.writes("--out", [_film_path(out, kind) for kind in kinds])
+        return
+    run.writes("--out", [_picture_path(stem, kind) for stem in stems for kind in kinds])
+    if DEPTH in kinds:
+        run.writes("--out", [_metric_path(stem) for stem in stems])
+
+
+def _film_path(out: Path, kind: str) -> Path:
+    return out.with_stem(out.stem + kind)
+
+
+def _picture_path(stem: Path, kind: str) -> Path:
+    return stem.with_name(stem.name + kind + PICTURE)
+
+
+def _metric_path(stem: Path) -> Path:
+    """Of the depth in world units."""
+    return stem.with_name(stem.name + DEPTH + ".npz")
 
 
 def _shots(
@@ -135,10 +193,9 @@ def _film(
                 f"--out {out}: {shot.name} has {shot.width}x{shot.height} pixels, {shots[0].name} {width}x{height}, "
                 "and a video has one size; add --size"
             )
-    check_writable(out.parent)
     ends: tuple[float, float] | None = None  # the first frame's, so that colours mean the same in all
     with ExitStack() as stack:
-        films = {kind: out.with_stem(out.stem + kind) for kind in kinds}
+        films = {kind: _film_path(out, kind) for kind in kinds}
         add = {kind: stack.enter_context(open_video(film, width, height, fps)) for kind, film in films.items()}
         for shot in progress(shots, "drawing"):
             drawn = draw(shot)
@@ -149,24 +206,18 @@ def _film(
 
 
 def _pictures(
-    draw: Callable[[Camera], Rendering],
-    shots: Sequence[Camera],
-    out: Path,
-    kinds: Sequence[str],
-    photographs: dict[Path, str],
+    draw: Callable[[Camera], Rendering], shots: Sequence[Camera], stems: Sequence[Path], kinds: Sequence[str]
 ) -> list[Path]:
     """A picture of each kind for each shot, and metric depth; the paths written."""
-    stems = _stems(shots, out, kinds, photographs)
-    check_writable(make_folder(stems[0].parent))
     written = []
     for shot, stem in progress(list(zip(shots, stems, strict=True)), "drawing"):
         drawn = draw(shot)
         for kind in kinds:
-            target = stem.with_name(stem.name + kind + PICTURE)
+            target = _picture_path(stem, kind)
             save_png(target, _picture(drawn, kind))
             written.append(target)
         if DEPTH in kinds:
-            metric = stem.with_name(stem.name + DEPTH + ".npz")
+            metric = _metric_path(stem)
             with replacing(metric) as temporary:
                 np.savez_compressed(temporary, depth=_depth(drawn))
             written.append(metric)
@@ -185,29 +236,13 @@ def _picture(drawn: Rendering, kind: str, ends: tuple[float, float] | None = Non
     return np.repeat(drawn.alpha[..., None], 3, axis=2) if kind == ALPHA else drawn.rgb
 
 
-def _stems(shots: Sequence[Camera], out: Path, kinds: Sequence[str], photographs: dict[Path, str]) -> list[Path]:
-    """The pictures' paths without kind and suffix; none of them may overwrite another, or a photograph."""
-    one = out.suffix.lower() == PICTURE
-    if one and len(shots) > 1:
-        raise InputError(f"--out {out}: {len(shots)} pictures do not fit one file; give a folder or an .mp4")
-    stems = [out.with_suffix("")] if one else [out / _posix(shot.name).stem for shot in shots]
-    name_of: dict[Path, str] = {}
-    for shot, stem in zip(shots, stems, strict=True):
-        for kind in kinds:
-            target = stem.with_name(stem.name + kind + PICTURE)
-            if target in name_of:
-                raise InputError(
-                    f"cameras {name_of[target]} and {shot.name} would both be drawn to {target}; "
-                    "rename one image, or split the cameras into two files"
-                )
-            if target.resolve() in photographs:
-                raise InputError(f"--out: the picture {target} would overwrite the photograph; choose another folder")
-            name_of[target] = shot.name
-    return stems
-
-
-def _posix(name: str) -> PurePosixPath:
-    return PurePosixPath(name.replace("\\", "/"))  # files written on Windows
+def _stems(names: Sequence[str], out: Path, kinds: Sequence[str]) -> list[Path]:
+    """The pictures' paths without kind and suffix; raises InputError if several are to go into one file."""
+    if out.suffix.lower() != PICTURE:
+        return [out / name for name in name_files(names, kinds)]
+    if len(names) > 1:
+        raise InputError(f"--out {out}: {len(names)} pictures do not fit one file; give a folder or an .mp4")
+    return [out.with_suffix("")]
 
 
 def _viewer(out: Path) -> str:

@@ -5,6 +5,7 @@ import re
 import threading
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import onnxruntime
 
 from . import openvino
 from .errors import InputError
+from .files import check_regular
 from .graph_cache import place_for
 
 CPU = "CPUExecutionProvider"
@@ -70,6 +72,9 @@ def open_session(model: Path | bytes, provider: str = CPU, tuning: Tuning = USUA
     Raises InputError if the file cannot be loaded, if ONNX Runtime silently fell back to another provider, or if
     OpenVINO has no processor to run on.
     """
+    if isinstance(model, Path):
+        with suppress(OSError):  # ONNX Runtime says that there is no such file
+            check_regular(model)
     options = _options(tuning)
     if provider == openvino.PROVIDER:
         openvino.add_openvino(options)

@@ -22,6 +22,11 @@ FULL_TURN = 360.0  # degrees of an orbit around a whole scene
 SWING = 30.0  # and around what cameras look at, which none of them has seen from behind
 FOCUS_SIDE = 96  # pixels of the picture that finds what a camera looks at
 FOCUS_ALPHA = 0.5
+STILL = "still"  # what `overview` calls its camera
+MOST_FRAMES = 10_000  # of a path or an orbit: more than five minutes of video, and numbers of four digits
+MOST_PIXELS = 1 << 26  # of a picture: an 8K screen has half as many
+LONGEST_SIDE = 1 << 16
+BYTES_PER_PIXEL = 56  # that drawing takes, measured
 
 
 def overview(gaussians: Gaussians, height: int, width: int) -> Camera:
@@ -37,7 +42,7 @@ def overview(gaussians: Gaussians, height: int, width: int) -> Camera:
     focal = min(width, height) / 2 / math.tan(FIELD_OF_VIEW / 2)
     pose = np.eye(4)
     pose[:3, 3] = middle - [0, 0, radius / math.sin(FIELD_OF_VIEW / 2)]
-    return Camera("still", width, height, _pinhole(focal, width, height), pose)
+    return Camera(STILL, width, height, _pinhole(focal, width, height), pose)
 
 
 def along_path(cameras: Sequence[Camera], frames: int) -> list[Camera]:
@@ -85,8 +90,25 @@ def focus(gaussians: Gaussians, camera: Camera) -> float:
     return float(np.median(drawn.depth[seen] / drawn.alpha[seen]))
 
 
+def frame_names(frames: int) -> list[str]:
+    """What the cameras of a path or an orbit are called."""
+    return [f"frame-{index:04d}" for index in range(frames)]
+
+
+def check_shots(shots: Sequence[Camera]) -> None:
+    """Raise InputError if one of the pictures would be too large to draw."""
+    for shot in shots:
+        if shot.width * shot.height > MOST_PIXELS or max(shot.width, shot.height) > LONGEST_SIDE:
+            gigabytes = shot.width * shot.height * BYTES_PER_PIXEL / 1e9
+            raise InputError(
+                f"{shot.name}: a picture of {shot.width} x {shot.height} pixels would take {gigabytes:.1f} GB to draw; "
+                f"expected {MOST_PIXELS:,} pixels and sides of {LONGEST_SIDE:,} at most; give a smaller --size"
+            )
+
+
 def _frames(poses: np.ndarray, K: np.ndarray, width: int, height: int) -> list[Camera]:
-    return [Camera(f"frame-{index:04d}", width, height, K, pose) for index, pose in enumerate(poses)]
+    names = frame_names(len(poses))
+    return [Camera(name, width, height, K, pose) for name, pose in zip(names, poses, strict=True)]
 
 
 def _pinhole(focal: float, width: int, height: int) -> np.ndarray:

@@ -2,13 +2,16 @@
 
 import contextlib
 import webbrowser
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from .cameras import CameraFormat
-from .errors import InputError, exit_on_input_error
+from .errors import InputError, Terminated, exit_on_input_error
+from .outputs import Overwrite, guards_outputs, outputs
+from .terminal import run, say
 
 if TYPE_CHECKING:
     from .cameras import Camera
@@ -19,6 +22,7 @@ PORT = 8080
 
 
 @exit_on_input_error
+@guards_outputs("idesplat-view")
 def view(
     scene: Annotated[Path, typer.Argument(help="Splat file of any format.", show_default=False)],
     cameras: Annotated[Path | None, typer.Option(help="Cameras to draw, such as a transforms.json.")] = None,
@@ -36,6 +40,7 @@ def view(
     host: Annotated[str, typer.Option(help="Address to serve at; other machines do not see the default.")] = LOOPBACK,
     port: Annotated[int, typer.Option(help="Port to serve at, 0 for any.", min=0, max=65535)] = PORT,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
+    overwrite: Overwrite = False,
 ) -> None:
     """Look at a splat file in the browser, from the first camera, with the cameras and their photographs around it.
 
@@ -47,19 +52,20 @@ def view(
     if images and cameras is None:
         raise InputError("--images: needs the cameras that took them; give --cameras")
     if html is not None:
-        _check_page(html)
+        _check_page(html, scene, cameras, [*(images or []), *(more_images or [])])
     gaussians = read_scene(scene)
     viewpoints = read_viewpoints(cameras, camera_format, [*(images or []), *(more_images or [])])
     viewpoints = _relative(viewpoints, scene)
     if html is None:
+        from .serving import address
         from .viewer import serving
 
-        with serving(gaussians, viewpoints, host, port) as server, contextlib.suppress(KeyboardInterrupt):
-            address = f"http://{host}:{server.get_port()}"
+        with serving(gaussians, viewpoints, host, port) as server, _until_interrupted():
+            page = address(host, server.get_port())
             click = "a click at a camera leads there, " if viewpoints else ""
-            print(f"{len(gaussians):,} Gaussians to look at: {address} ({click}stop with Ctrl-C)", flush=True)
+            say(f"{len(gaussians):,} Gaussians to look at: {page} ({click}stop with Ctrl-C)")
             if browser:
-                webbrowser.open(address)
+                webbrowser.open(page)
             server.sleep_forever()
         return
     from .files import replacing
@@ -70,21 +76,36 @@ def view(
         page = standalone_page(gaussians, viewpoints)
     with replacing(html) as temporary:
         temporary.write_text(page, encoding="utf-8")
-    print(f"wrote {html}: {len(gaussians):,} Gaussians, {html.stat().st_size / 1e6:.1f} MB; open it in any browser")
+    say(f"wrote {html}: {len(gaussians):,} Gaussians, {html.stat().st_size / 1e6:.1f} MB; open it in any browser")
 
 
 def main() -> None:
     """Entry point of idesplat-view."""
-    typer.run(view)
+    run(view)
 
 
-def _check_page(html: Path) -> None:
-    """Find out before the work whether the page can be written."""
-    from .files import check_writable
+@contextlib.contextmanager
+def _until_interrupted() -> Iterator[None]:
+    """Take Ctrl-C, by which a user ends this command, for its success; another signal is none."""
+    try:
+        yield
+    except Terminated:
+        raise
+    except KeyboardInterrupt:
+        return
+
+
+def _check_page(html: Path, scene: Path, cameras: Path | None, images: list[Path]) -> None:
+    """Find out before the work whether the page can be written, and is none of the files to read."""
+    from .input_files import camera_files, given_images
 
     if html.suffix.lower() not in (".html", ".htm") or html.is_dir():
         raise InputError(f"--html {html}: expected a file to write, whose name ends in .html")
-    check_writable(html.parent)
+    run = outputs()
+    run.reads("the scene", [scene])
+    run.reads("the cameras", camera_files(cameras) if cameras else [])
+    run.reads("a photograph", given_images(images))
+    run.writes("--html", [html])
 
 
 def _relative(viewpoints: "list[Viewpoint]", scene: Path) -> "list[Viewpoint]":
@@ -101,10 +122,10 @@ def read_viewpoints(cameras: Path | None, form: CameraFormat | None, images: lis
 
     Raises InputError for what cannot be read, or does not belong together.
     """
-    import tempfile
     from dataclasses import replace
 
     from .cameras import read_cameras
+    from .files import scratch_folder
     from .photographs import find_photographs
     from .progress import progress
     from .viewer import Viewpoint
@@ -117,8 +138,8 @@ def read_viewpoints(cameras: Path | None, form: CameraFormat | None, images: lis
             Viewpoint(replace(camera, distortion=None, fisheye=False), None)
             for camera in read_cameras(cameras, form=form)
         ]
-    with tempfile.TemporaryDirectory() as folder:
-        files = find_photographs(images, cameras, form, Path(folder))
+    with scratch_folder() as folder:
+        files = find_photographs(images, cameras, form, folder)
         pairs = match(files, read_cameras(cameras, files, form))
         return [_viewpoint(file, camera) for file, camera in progress(pairs, "reading photographs")]
 

@@ -7,7 +7,6 @@ the world's axes, the origin where the page's camera starts, and `DISTANCE` from
 import contextlib
 import io
 import math
-import socket
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -22,6 +21,7 @@ from .errors import InputError
 from .gaussians import Gaussians
 from .images_out import to_bytes
 from .quaternions import quaternions_from_matrices, rotation_matrices
+from .serving import free_port, only_own_page
 from .shots import focus, overview
 
 if TYPE_CHECKING:
@@ -60,10 +60,10 @@ class Viewpoint(NamedTuple):
 def serving(
     gaussians: Gaussians, viewpoints: Sequence[Viewpoint], host: str, port: int
 ) -> Iterator["viser.ViserServer"]:
-    """A server of the page for as long as the block runs; port 0 for any that is free.
+    """A server of the page for as long as the block runs; port 0 for any that is free, else `port` or the next free.
 
-    The page starts at the first viewpoint or, without any, where the whole scene is seen. A click at another viewpoint
-    leads there.
+    No other page may connect (see `serving`). The page starts at the first viewpoint or, without any, where the whole
+    scene is seen. A click at another viewpoint leads there.
     Raises InputError if viser is not installed, the place cannot be served at, or there is nothing to see.
     """
     first = viewpoints[0].camera if viewpoints else overview(gaussians, *SIZE)
@@ -98,14 +98,8 @@ def _start(host: str, port: int) -> "viser.ViserServer":
         import viser
     except ImportError:
         raise InputError(f"looking at scenes needs viser, which is not installed: {INSTALL}") from None
-    # viser would take the next free port instead, and say so where nobody looks
-    try:
-        with socket.create_server((host, port)):
-            pass
-    except (OSError, OverflowError) as error:
-        reason = str(getattr(error, "strerror", None) or error).split(" (")[0]
-        raise InputError(f"cannot serve at {host} port {port}: {reason}; choose another --port, or 0 for any") from None
-    with _quiet():
+    port = free_port(host, port)
+    with _quiet(), only_own_page(host):
         return viser.ViserServer(host, port, verbose=False)
 
 

@@ -5,6 +5,10 @@ import shutil
 import sys
 from pathlib import Path
 
+# Compiled code is kept between test runs, but not in the user's cache.
+os.environ["NUMBA_CACHE_DIR"] = str(Path(__file__).parent.parent / ".pytest_cache" / "numba")
+
+import idesplat.runtime  # noqa: F401  # first: it switches ONNX Runtime's telemetry off
 import pytest
 import torch
 from idesplat.model.config import (

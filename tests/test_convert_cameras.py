@@ -55,13 +55,13 @@ def test_pictures_give_the_size(folder, capsys):
         (("none.json", "out.json"), "none.json: cannot be read"),
         (("c.json", "out.txt"), "expected a file that ends in .json"),
         (("c.json", "./c.json"), "would replace the cameras"),
-        (("c.json", "nowhere/out.json"), "cannot write nowhere/out.json"),
+        (("c.json", "poses_bounds.npy/out.json"), "poses_bounds.npy is not a folder"),
         (("c.json", "out.json", "--camera-format", "re10k"), "c.json: line 1: has"),
     ],
 )
 def test_mistakes(folder, capfd, arguments, expected):
     Path("c.json").write_text('{"format": "idesplat-cameras", "version": 1, "cameras": []}\n')
-    if "nowhere" in arguments[1]:
+    if "poses_bounds" in arguments[1]:
         Path("c.json").unlink()
         np.save("poses_bounds.npy", as_llff(known(["0", "1"], CENTRED)))
         arguments = ("poses_bounds.npy", *arguments[1:])

@@ -12,7 +12,10 @@ import trimesh
 from conftest import run_command
 from idesplat.runtime.cameras import read_cameras
 from idesplat.runtime.cli import main
+from idesplat.runtime.files import replacing
 from idesplat.runtime.formats import read_scene
+from idesplat.runtime.inputs import pick_frames
+from idesplat.runtime.outputs import Outputs
 from idesplat.runtime.ply import read_ply
 from idesplat.runtime.render import main as render_main
 from idesplat.runtime.view import main as view_main
@@ -57,6 +60,11 @@ def test_everything_it_can_write(workplace, scene, capsys):
     assert cv2.imread(str(frames[0])).shape == (64, 96, 3)
     printed = capsys.readouterr().out
     assert f"near {summary['near']:.4g} and far {summary['far']:.4g}" in printed
+    size = Path("scene.ply").stat().st_size / 1e6
+    assert (
+        f"wrote scene.ply: {len(gaussians):,} Gaussians, {size:.1f} MB, in {summary['seconds']['total']:.1f} s"
+        in printed
+    )
     for text in (
         "wrote scene.ply",
         "wrote summary.json",
@@ -152,6 +160,32 @@ def test_chosen_frames_and_cameras_written(workplace, capsys):
     assert "photographs used" not in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("frames", "numbers"),
+    [
+        ("0-3", [0, 1, 2, 3]),
+        ("0:8:2", [0, 2, 4, 6]),
+        ("5:,1", [5, 6, 7, 1]),
+        ("::3", [0, 3, 6]),
+        (":2", [0, 1]),
+        ("4-4,6", [4, 6]),
+        ("r_0.7,3-4", [7, 3, 4]),
+        ("1-2", [5]),  # the image of that name
+    ],
+)
+def test_frames_by_range(frames, numbers):
+    images = [Path(name) for name in ("a.png", "b.png", "c.png", "d.png", "e.png", "1-2.png", "r_0.5", "r_0.7")]
+    assert pick_frames(images, frames) == [images[number] for number in numbers]
+
+
+def test_the_summary_on_standard_output(workplace, capsys):
+    assert run_command(main, *USUAL, "--json", "-", "--save-depth", "new/depth", "--timings") == 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["gaussians"] == 2 * 64 * 96
+    assert "wrote scene.ply" in printed.err and "open scene.ply" in printed.err
+    assert not Path("-").exists()
+
+
 def test_cameras_of_another_format_give_the_same(workplace):
     given = (*USUAL, "--frames", "0,2", "--near", "1", "--far", "20")
     assert run_command(main, *given) == 0
@@ -183,7 +217,10 @@ def test_photographs_alone(workplace, tmp_path_factory, capsys):
     assert run_command(render_main, "scene.ply", "--cameras", "found.json", "--out", "drawn") == 0
     assert run_command(main, *given, "--focal", focal) == 0
     printed = capsys.readouterr().out
-    assert "--save-cameras FILE.json" in printed and "idesplat-view scene.ply\n" in printed
+    assert "wrote scene.cameras.json" in printed and "idesplat-view scene.ply --cameras scene.cameras.json" in printed
+    assert f"focal length {float(focal):.0f} pixels, of photographs 320 wide and 240 high" in printed
+    names = [camera.name for camera in read_cameras(Path("scene.cameras.json"))]
+    assert [Path(name).resolve() for name in names] == sorted((folder / "images").iterdir())  # as seen from the file
     Path("scene.ply").unlink()
     assert run_command(main, *given) == 2  # no focal length
     assert not Path("scene.ply").exists()
@@ -259,8 +296,14 @@ BAD = {
     "no model": (lambda: Path("model.onnx").unlink(), (), "model.onnx"),
     "an unknown provider": (nothing, ("--provider", "Abacus"), "Abacus"),
     "a provider that is not installed": (nothing, ("--provider", "CUDA"), "CUDA"),
-    "an output folder that is not there": (nothing, ("--out", "nowhere/scene.ply"), "nowhere"),
     "an output folder that nobody may write to": (nothing, ("--out", "/proc/scene.ply"), "cannot write into /proc"),
+    "an output folder that nobody may make": (nothing, ("--out", "/proc/a/b.ply"), "cannot write into /proc"),
+    "a range beyond the images": (nothing, ("--frames", "0-5"), "--frames 0-5: no image is called so"),
+    "a range that ends before it begins": (nothing, ("--frames", "3-1"), "--frames 3-1: no image is called so"),
+    "a slice beyond the images": (nothing, ("--frames", "0:9"), "--frames 0:9: no image is called so"),
+    "a slice without steps": (nothing, ("--frames", "0:4:0"), "--frames 0:4:0: no image is called so"),
+    "a number that is none": (nothing, ("--frames", "²,³"), "--frames ²: no image is called so"),
+    "a number of too many digits": (nothing, ("--frames", "9" * 5000), "no image is called so"),
     "a share that is none": (nothing, ("--min-opacity", "2"), "--min-opacity 2"),
     "a surface without faint splats": (
         nothing,
@@ -277,7 +320,8 @@ BAD = {
 def test_bad_input_is_one_line_and_leaves_nothing(workplace, capfd, name):
     spoil, arguments, expected = BAD[name]
     spoil()
-    Path("scene.ply").write_bytes(b"the result of yesterday")
+    with Outputs("idesplat-infer"), replacing(Path("scene.ply")) as temporary:
+        temporary.write_bytes(b"the result of yesterday")
     before = {path: path.stat().st_mtime_ns for path in workplace.rglob("*")}
     options = dict(zip(USUAL[::2], USUAL[1::2], strict=True)) | dict(zip(arguments[::2], arguments[1::2], strict=True))
     assert run_command(main, *(part for option in options.items() for part in option)) == 2

@@ -3,11 +3,14 @@
 import json
 import subprocess
 import sys
+from fractions import Fraction
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
+from idesplat.runtime import render, video_out
 from idesplat.runtime.cameras import Camera, write_cameras
 from idesplat.runtime.drawing import draw_view
 from idesplat.runtime.errors import InputError
@@ -18,6 +21,7 @@ from idesplat.runtime.ply import read_ply, write_ply
 from idesplat.runtime.rasterizer import rasterize
 from idesplat.runtime.render import main
 from idesplat.runtime.shots import around, fitted, overview
+from idesplat.runtime.video_out import open_video
 
 SH_0 = 0.28209479177387814
 
@@ -82,9 +86,7 @@ def test_draws_every_camera_at_its_own_size(
         "--out",
         out,
         "--background",
-        1,
-        0,
-        0.5,
+        "1,0,0.5",
     )
     printed = capsys.readouterr()
     assert status == 0
@@ -118,40 +120,38 @@ def test_a_transforms_json_worked_by_hand(tmp_path: Path, monkeypatch: pytest.Mo
     assert picture[15, 40].tolist() == [round(0.99 * 255), 0, 0]
 
 
-@pytest.mark.parametrize("names", [("left/0001.jpg", "right/0001.jpg"), ("a\\0001.jpg", "0001.png")])
+@pytest.mark.parametrize(
+    ("names", "written"),
+    [
+        (("left/0001.jpg", "right/0001.jpg"), ("left-0001", "right-0001")),
+        (("a\\0001.jpg", "0001.png"), ("a-0001", "0001")),
+        (("r_0.5", "r_0.7"), ("r_0.5", "r_0.7")),
+        (("a.png", "a.jpg", "0-a.png"), ("0-a", "1-a", "2-0-a")),
+        (("A.jpg", "a.jpg"), ("0-A", "1-a")),
+    ],
+)
 def test_pictures_never_overwrite_each_other(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, names: tuple[str, str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, names: tuple[str, ...], written: tuple[str, ...]
 ) -> None:
     write_ply(tmp_path / "scene.ply", one_gaussian((0, 0, 2), (1, 1, 1)))
     write_cameras(tmp_path / "cameras.json", [Camera(name, 8, 8, pinhole(8, 8), np.eye(4)) for name in names])
     out = tmp_path / "out"
-    assert run(monkeypatch, tmp_path / "scene.ply", "--cameras", tmp_path / "cameras.json", "--out", out) == 2
-    assert f"cameras {names[0]} and {names[1]} would both be drawn to" in capsys.readouterr().err
-    assert not out.exists()
-
-
-def test_pictures_never_overwrite_photographs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    images = tmp_path / "images"
-    images.mkdir()
-    (images / "0001.png").write_bytes(b"a photograph")
-    write_ply(tmp_path / "scene.ply", one_gaussian((0, 0, 2), (1, 1, 1)))
-    write_cameras(tmp_path / "cameras.json", [Camera("images/0001.png", 8, 8, pinhole(8, 8), np.eye(4))])
-    assert run(monkeypatch, tmp_path / "scene.ply", "--cameras", tmp_path / "cameras.json", "--out", images) == 2
-    assert "would overwrite the photograph" in capsys.readouterr().err
-    assert (images / "0001.png").read_bytes() == b"a photograph"
+    assert run(monkeypatch, tmp_path / "scene.ply", "--cameras", tmp_path / "cameras.json", "--out", out) == 0
+    assert {path.name for path in out.iterdir()} == {f"{name}.png" for name in written}
 
 
 @pytest.mark.parametrize(
     ("scene", "cameras", "background", "message"),
     [
-        ("none.ply", "cameras.json", (0, 0, 0), "none.ply: No such file"),
-        ("cameras.json", "cameras.json", (0, 0, 0), "cameras.json: expected a file name"),
-        ("scene.ply", "none.json", (0, 0, 0), "none.json"),
-        ("scene.ply", "scene.ply", (0, 0, 0), "scene.ply: is none of the camera files"),
-        ("scene.ply", "cameras.json", (0, 255, 0), "--background is (0.0, 255.0, 0.0)"),
-        ("scene.ply", "cameras.json", (0, "nan", 0), "--background is (0.0, nan, 0.0)"),
+        ("none.ply", "cameras.json", "0,0,0", "none.ply: No such file"),
+        ("cameras.json", "cameras.json", "0,0,0", "cameras.json: expected a splat file"),
+        ("scene.ply", "none.json", "0,0,0", "none.json"),
+        ("scene.ply", "scene.ply", "0,0,0", "scene.ply: is none of the camera files"),
+        ("scene.ply", "cameras.json", "0,255,0", "--background 0,255,0: expected red, green and blue from 0 to 1"),
+        ("scene.ply", "cameras.json", "0,nan,0", "--background 0,nan,0"),
+        ("scene.ply", "cameras.json", "1,1", "--background 1,1"),
+        ("scene.ply", "cameras.json", "white", "--background white"),
+        ("scene.ply", "cameras.json", "1,1,1,1", "--background 1,1,1,1"),
     ],
 )
 def test_bad_input_is_one_line_and_writes_nothing(
@@ -160,13 +160,13 @@ def test_bad_input_is_one_line_and_writes_nothing(
     capsys: pytest.CaptureFixture,
     scene: str,
     cameras: str,
-    background: tuple,
+    background: str,
     message: str,
 ) -> None:
     write_ply(tmp_path / "scene.ply", one_gaussian((0, 0, 2), (1, 1, 1)))
     write_cameras(tmp_path / "cameras.json", [Camera("0001.jpg", 8, 8, pinhole(8, 8), np.eye(4))])
     out = tmp_path / "out"
-    arguments = (tmp_path / scene, "--cameras", tmp_path / cameras, "--out", out, "--background", *background)
+    arguments = (tmp_path / scene, "--cameras", tmp_path / cameras, "--out", out, "--background", background)
     assert run(monkeypatch, *arguments) == 2
     printed = capsys.readouterr()
     assert message in printed.err
@@ -208,11 +208,12 @@ def a_ball_of_gaussians(centre: tuple[float, float, float] = (1, -2, 5), count: 
 
 def read_video(path: Path) -> tuple[np.ndarray, float]:
     """All frames as RGB, [frames, height, width, 3], and how many a second."""
-    video = cv2.VideoCapture(str(path))
-    frames = []
-    while (frame := video.read()[1]) is not None:
-        frames.append(frame[..., ::-1])
-    return np.stack(frames), video.get(cv2.CAP_PROP_FPS)
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        frames = [
+            frame.reformat(format="rgb24", src_colorspace="ITU709").to_ndarray() for frame in container.decode(stream)
+        ]
+        return np.stack(frames), float(stream.average_rate)
 
 
 def psnr(drawn: np.ndarray, expected: np.ndarray) -> float:
@@ -314,13 +315,13 @@ def test_an_orbit_as_a_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ca
     films = {name: read_video(tmp_path / f"orbit{name}.mp4") for name in ("", "-depth", "-alpha")}
     assert {path.name for path in tmp_path.iterdir()} == {"scene.ply", *(f"orbit{name}.mp4" for name in films)}
     for frames, fps in films.values():
-        assert frames.shape == (6, 96, 128, 3)  # videos have even sides
+        assert frames.shape == (6, 98, 128, 3)  # videos have even sides
         assert fps == pytest.approx(12)
     for index, shot in enumerate(shots):
         drawn = draw_view(ball, shot.extrinsics, shot.K, 128, 97)
-        assert psnr(films[""][0][index], drawn.rgb[:96]) > 25
-        assert psnr(films["-alpha"][0][index], np.repeat(drawn.alpha[:96, :, None], 3, axis=2)) > 25
-    assert psnr(films[""][0][3], draw_view(ball, shots[0].extrinsics, shots[0].K, 128, 97).rgb[:96]) < 25
+        assert psnr(films[""][0][index][:97], drawn.rgb) > 25
+        assert psnr(films["-alpha"][0][index][:97], np.repeat(drawn.alpha[..., None], 3, axis=2)) > 25
+    assert psnr(films[""][0][3][:97], draw_view(ball, shots[0].extrinsics, shots[0].K, 128, 97).rgb) < 25
     assert "orbit-depth.mp4" in capsys.readouterr().out
 
 
@@ -361,7 +362,11 @@ def test_a_path_through_the_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (("--out", "a.mp4", "--cameras", "cameras.json"), "a video has one size; add --size"),
         (("--out", "a.png", "--cameras", "cameras.json"), "2 pictures do not fit one file"),
         (("--out", "a.png", "--orbit"), "90 pictures do not fit one file"),
-        (("--out", "nowhere/a.mp4"), "cannot write into nowhere"),
+        (("--out", "scene.ply/a.mp4"), "scene.ply is not a folder"),
+        (("--out", "out", "--size", "9000x9000"), "a picture of 9000 x 9000 pixels would take 4.5 GB"),
+        (("--out", "a.mp4", "--orbit", "--size", "5000x70000"), "sides of 65,536 at most"),
+        (("--out", "out", "--orbit", "--frames", "10001"), "--frames 10001: expected 1 to 10000"),
+        (("--out", "a.mp4", "--orbit", "--frames", "0"), "--frames 0: expected 1 to 10000"),
         (("--out", "a.jpg"), "--out a.jpg: expected a folder, or a file that ends in .png or .mp4"),
         (("--out", "a.MOV", "--orbit"), "expected a folder, or a file that ends in .png or .mp4"),
     ],
@@ -379,15 +384,64 @@ def test_requests_that_make_no_picture(
     assert {path.name for path in tmp_path.iterdir()} == {"scene.ply", "cameras.json"}
 
 
-def test_a_depth_picture_never_overwrites_another_cameras(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
+def test_a_depth_picture_never_overwrites_another_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_ply(tmp_path / "scene.ply", a_ball_of_gaussians())
     cameras = [Camera(name, 20, 30, pinhole(20, 30), pose((0, 0, 0), (1, -2, 0))) for name in ("a.jpg", "a-depth.jpg")]
     write_cameras(tmp_path / "cameras.json", cameras)
     options = ("--cameras", tmp_path / "cameras.json", "--out", tmp_path / "out", "--depth")
-    assert run(monkeypatch, tmp_path / "scene.ply", *options) == 2
-    assert "cameras a.jpg and a-depth.jpg would both be drawn to" in capsys.readouterr().err
+    assert run(monkeypatch, tmp_path / "scene.ply", *options) == 0
+    stems = ("0-a", "1-a-depth")
+    endings = (".png", "-depth.png", "-depth.npz")
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {stem + end for stem in stems for end in endings}
+
+
+def test_a_video_is_what_browsers_play(tmp_path: Path) -> None:
+    path = tmp_path / "a.mp4"
+    frame = np.stack([*np.meshgrid(np.linspace(0, 1, 65), np.linspace(0, 1, 33)), np.full((33, 65), 0.5)], axis=-1)
+    with open_video(path, 65, 33, 30000 / 1001) as add:
+        for _ in range(4):
+            add(frame)
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        assert (container.format.name.split(",")[0], stream.codec_context.name) == ("mov", "h264")
+        assert stream.pix_fmt == "yuv420p" and (stream.width, stream.height) == (66, 34)
+        assert stream.average_rate == Fraction(30000, 1001)
+        assert (stream.codec_context.colorspace, stream.codec_context.color_range) == (1, 1)  # BT.709, limited
+    content = path.read_bytes()
+    assert 0 < content.index(b"moov") < content.index(b"mdat")
+    frames, _ = read_video(path)
+    assert len(frames) == 4 and psnr(frames[2][:33, :65], frame) > 35
+    np.testing.assert_array_equal(frames[0][33, :64] // 8, frames[0][32, :64] // 8)  # padded with what is beside
+
+
+def test_a_video_without_its_library(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.setattr(video_out, "find_spec", lambda name: None)
+    monkeypatch.chdir(tmp_path)
+    write_ply(Path("scene.ply"), a_ball_of_gaussians())
+    assert run(monkeypatch, "scene.ply", "--orbit", "--out", "a.mp4") == 2
+    assert "pip install 'idesplat[video]'" in capsys.readouterr().err
+    assert not Path("a.mp4").exists()
+
+
+def test_folders_are_made_and_left_only_with_what_they_are_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_ply(Path("scene.ply"), a_ball_of_gaussians())
+    assert run(monkeypatch, "scene.ply", "--size", "24x32", "--out", "new/folder/a.png") == 0
+    assert run(monkeypatch, "scene.ply", "--size", "24x32", "--frames", 2, "--orbit", "--out", "new/one/a.mp4") == 0
+    assert {path.name for path in Path("new").rglob("*.*")} == {"a.png", "a.mp4"}
+
+    def fails(*arguments: object) -> None:
+        raise InputError("it cannot be drawn")
+
+    monkeypatch.setattr(render, "draw_view", fails)
+    for out in ("other/one/a.mp4", "other/a.png", "other/folder"):
+        assert run(monkeypatch, "scene.ply", "--size", "24x32", "--out", out) == 2
+        assert "it cannot be drawn" in capsys.readouterr().err
+    assert not Path("other").exists()
 
 
 # ---- camera paths

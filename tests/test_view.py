@@ -1,6 +1,5 @@
 """The command idesplat-view in a real browser: the page, and the file to send, show what the rasteriser draws."""
 
-import socket
 import subprocess
 import sys
 import time
@@ -245,13 +244,6 @@ def test_refusals(folder, camera, arguments, words, monkeypatch, capsys):
     assert words in printed.err
     assert printed.err.count("\n") == 1
     assert sorted(folder.iterdir()) == before
-
-
-def test_a_port_that_is_taken(folder, capsys):
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        assert run_command(main, folder / "scene.ply", "--port", port) == 2
-    assert f"port {port}: Address already in use; choose another --port" in capsys.readouterr().err
 
 
 def test_without_viser(folder, capsys, monkeypatch):

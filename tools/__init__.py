@@ -1,1 +1,3 @@
+"""What trains, evaluates and measures."""
 
+from ..runtime import startup as startup

@@ -7,7 +7,6 @@ the same networks in eager PyTorch where that is installed.
 
 import os
 import platform
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -20,8 +19,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..runtime.errors import InputError, exit_on_input_error
-from ..runtime.files import check_writable
+from ..runtime.input_files import model_files
+from ..runtime.outputs import STANDARD_OUTPUT, Overwrite, guards_outputs, outputs
 from ..runtime.sizes import parse_size
+from ..runtime.terminal import run, say, warn
 
 if TYPE_CHECKING:  # nothing heavy is loaded before there is something to measure
     from .bench_report import Row
@@ -57,6 +58,7 @@ class Entry:
 
 
 @exit_on_input_error
+@guards_outputs("idesplat-bench")
 def bench(
     models: Annotated[
         list[Path] | None, typer.Argument(help="Models (.onnx or staged folders) instead of the carried one.")
@@ -69,17 +71,19 @@ def bench(
     repeats: Annotated[int, typer.Option(help="Rounds.", min=1)] = 7,
     threads: Annotated[int | None, typer.Option(help="Threads of each, instead of one a core.", min=1)] = None,
     eager: Annotated[bool, typer.Option(help="Run the same networks in PyTorch, where it is installed.")] = True,
-    json_path: Annotated[Path | None, typer.Option("--json", help="Write everything as JSON.")] = None,
+    json_path: Annotated[
+        Path | None, typer.Option("--json", help="Write everything as JSON, to standard output if it is -.")
+    ] = None,
     compare: Annotated[
         Path | None, typer.Option(help="Such a JSON; exit with status 1 if anything became worse since.")
     ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Measure time and memory of exported models side by side, each in a fresh process. Ctrl-C keeps what is done."""
     from .bench_report import compare as compare_rows
     from .bench_report import print_rows, read_rows, write_rows
 
-    if json_path is not None:
-        check_writable(json_path.parent)
+    _check_json(json_path, [*(models or []), *([compare] if compare else [])])
     before = read_rows(compare) if compare is not None else []
     settings = _settings(threads, repeats, eager)
     rows: list[Row] = []
@@ -91,28 +95,38 @@ def bench(
         interrupted = True
     for row in rows:
         if row.problem:
-            print(f"{row.name}: {row.problem}", file=sys.stderr)
+            warn(f"{row.name}: {row.problem}")
     rows = [row for row in rows if row.seconds]
     if rows:
         print_rows(rows)
     if rows and json_path is not None:
         write_rows(json_path, _machine(settings), rows)
-        print(f"wrote {json_path}")
+        if json_path != STANDARD_OUTPUT:
+            say(f"wrote {json_path}")
     if interrupted:
-        print("interrupted: what was not finished is missing", file=sys.stderr)
+        warn("interrupted: what was not finished is missing")
         raise SystemExit(INTERRUPTED)
     if not rows:
         raise InputError("nothing could be measured, for the reasons above")
     worse = compare_rows(rows, before) if compare is not None else []
     for line in worse:
-        print(f"worse: {line}", file=sys.stderr)
+        warn(f"worse: {line}")
     if worse:
         raise SystemExit(WORSE)
 
 
 def main() -> None:
     """Run the command."""
-    typer.run(bench)
+    run(bench)
+
+
+def _check_json(json_path: Path | None, read: Sequence[Path]) -> None:
+    """Find out before the work whether the JSON can be written, and is none of the files to read."""
+    if json_path is None or json_path == STANDARD_OUTPUT:
+        return
+    for path in read:
+        outputs().reads("a model or measurements", model_files(path))
+    outputs().writes("--json", [json_path])
 
 
 # ---- measuring
@@ -225,7 +239,7 @@ def _add_shares(row: "Row", entry: Entry, workload: "Workload", settings: Settin
         with Worker(analyse, entry.model, entry.provider, settings.threads, workload) as worker:
             row.operators, row.stages, row.flop = (worker.about[part] for part in ("operators", "stages", "flop"))
     except Failed as problem:
-        print(f"{row.name}: nothing is known of where its time goes ({problem})", file=sys.stderr)
+        warn(f"{row.name}: nothing is known of where its time goes ({problem})")
 
 
 # ---- what is measured

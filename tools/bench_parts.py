@@ -1,6 +1,6 @@
 """The rasteriser and .ply files, timed in turn with what else does their work: numbers for docs/performance.md.
 
-python -m idesplat.tools.bench_parts
+python -P -m idesplat.tools.bench_parts
 
 gsplat's torch reference projects and colours on a CPU, but composites with CUDA alone: that step is ours, in torch as
 well, with every fragment of the image at once, sorted by pixel and depth.
@@ -21,6 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ..runtime.session import usable_cores
+from ..runtime.terminal import run
 from .bench import SETTLE_SECONDS, thread_environment
 from .bench_worker import Prepared, Worker
 
@@ -231,4 +232,4 @@ def ply_file(folder: Path, verb: str) -> Prepared:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run(main)

@@ -1,6 +1,6 @@
 """The sparse products in ONNX Runtime, gathered at once and in steps: numbers for docs/performance.md.
 
-python -m idesplat.tools.bench_products
+python -P -m idesplat.tools.bench_products
 """
 
 import tempfile
@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from ..export.sparse_products import FEW, explain, in_steps
 from ..model.sparse_products import SparseProducts
+from ..runtime.terminal import run
 from .bench import thread_environment
 from .bench_parts import race
 from .bench_worker import Prepared
@@ -120,4 +121,4 @@ def example(shape: Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run(main)

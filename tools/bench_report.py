@@ -11,7 +11,8 @@ from rich.console import Console
 from rich.table import Table
 
 from ..runtime.errors import InputError
-from ..runtime.files import replacing
+from ..runtime.files import read_bytes
+from ..runtime.outputs import write_json
 
 WIDTH = 150  # columns, where there is no terminal to ask
 SHOWN = 7  # operators of a row
@@ -97,18 +98,15 @@ def print_rows(rows: Sequence[Row]) -> None:
 
 def write_rows(path: Path, machine: dict[str, Any], rows: Sequence[Row]) -> None:
     """Write everything that was measured as JSON."""
-    with replacing(path) as temporary:
-        temporary.write_text(json.dumps({"machine": machine, "rows": [asdict(row) for row in rows]}, indent=1) + "\n")
+    write_json(path, json.dumps({"machine": machine, "rows": [asdict(row) for row in rows]}, indent=1))
 
 
 def read_rows(path: Path) -> list[Row]:
     """The rows of a file that `write_rows` wrote; raises InputError."""
     try:
-        return [Row(**entry) for entry in json.loads(path.read_text())["rows"]]
-    except OSError as error:
-        raise InputError(
-            f"cannot read {path}: {error.strerror}; expected what --json of idesplat-bench wrote"
-        ) from None
+        return [Row(**entry) for entry in json.loads(read_bytes(path, "what --json of idesplat-bench wrote"))["rows"]]
+    except InputError:
+        raise
     except (ValueError, TypeError, KeyError):
         raise InputError(f"{path}: not what --json of this version of idesplat-bench writes") from None
 

@@ -2,12 +2,13 @@
 
 import json
 import multiprocessing
+import os
 import signal
 import sys
-import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from math import prod
 from multiprocessing.connection import Connection
@@ -27,6 +28,7 @@ LOOPS = ("Scan", "Loop", "If")
 # Operators whose FLOP are counted, as a graph has them before it is optimised.
 PRODUCTS = ("MatMul", "MatMulInteger", "Gemm", "Conv", "ConvTranspose")
 RUN = "run"
+SAFE_PATH = "PYTHONSAFEPATH"
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,8 @@ class Worker:
         context = multiprocessing.get_context("spawn")
         self._pipe, other = context.Pipe()
         self._process = context.Process(target=_serve, args=(other, prepare, arguments), daemon=True)
-        self._process.start()
+        with _safe_path():
+            self._process.start()
         other.close()
         self.about = self._answer()
 
@@ -93,6 +96,20 @@ class Worker:
         if isinstance(answer, Failed):
             raise answer
         return answer
+
+
+@contextmanager
+def _safe_path() -> Iterator[None]:
+    """Keep the Python processes that start meanwhile from importing modules of the current folder."""
+    before = os.environ.get(SAFE_PATH)
+    os.environ[SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[SAFE_PATH]
+        else:
+            os.environ[SAFE_PATH] = before
 
 
 def _serve(pipe: Connection, prepare: Callable[..., Prepared], arguments: tuple) -> None:
@@ -228,11 +245,12 @@ def example_arrays(workload: Workload, near: float, far: float) -> tuple[np.ndar
 
 def _profile(model: Path, provider: str, threads: int, workload: Workload, optimise: bool) -> list[dict[str, Any]]:
     """ONNX Runtime's notes on every operator of a run; where it is optimised, of one that is not the first."""
+    from ..runtime.files import scratch_folder
     from ..runtime.runner import Runner
     from ..runtime.session import Tuning
 
-    with tempfile.TemporaryDirectory() as folder:
-        runner = Runner(model, provider, Tuning(threads, Path(folder) / "profile", optimise))
+    with scratch_folder() as folder:
+        runner = Runner(model, provider, Tuning(threads, folder / "profile", optimise))
         arrays = example_arrays(workload, runner.description.near, runner.description.far)
         for _ in range(TIMES_PROFILED if optimise else 1):
             runner.predict_arrays(*arrays)

@@ -1,6 +1,6 @@
 """How far depth moves where one part of a network multiplies in bfloat16: numbers for docs/performance.md.
 
-python -m idesplat.tools.bfloat16 [MODEL]
+python -P -m idesplat.tools.bfloat16 [MODEL]
 
 What a processor does that multiplies in bfloat16 and adds in float32 is done by hand: operands are rounded before.
 """
@@ -18,6 +18,7 @@ from ..runtime.default_model import default_model
 from ..runtime.errors import exit_on_input_error
 from ..runtime.runner import Runner
 from ..runtime.session import open_session, run_session
+from ..runtime.terminal import run
 from .cases import procedural_case
 from .scenes import HELD_OUT_SEEDS
 
@@ -97,4 +98,4 @@ def _change(found: list[np.ndarray], exact: list[np.ndarray]) -> float:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run(main)

@@ -1,6 +1,6 @@
 """Make a trained checkpoint the model that is carried along.
 
-    python -m idesplat.tools.carry runs/tiny/last.ckpt
+    python -P -m idesplat.tools.carry runs/tiny/last.ckpt
 
 Exports it, verified, to `runtime/default/`, and writes its checksum beside it.
 """
@@ -15,6 +15,7 @@ from ..export.cli import export
 from ..runtime.default_model import CHECKSUM_SUFFIX, FOLDER, NAME
 from ..runtime.errors import exit_on_input_error
 from ..runtime.files import make_folder, replacing
+from ..runtime.terminal import run
 
 PRESET = "idesplat-tiny"
 
@@ -33,7 +34,7 @@ def carry(
 
 def main() -> None:
     """Run the command."""
-    typer.run(carry)
+    run(carry)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """The README's table of supported checkpoints, every number of it measured where this runs.
 
-    python -m idesplat.tools.checkpoint_table
-    python -m idesplat.tools.checkpoint_table depthsplat-small-re10k depthsplat-base-re10k
+    python -P -m idesplat.tools.checkpoint_table
+    python -P -m idesplat.tools.checkpoint_table depthsplat-small-re10k depthsplat-base-re10k
 
 Each preset's weights are drawn at random and exported by idesplat-export, and what comes of it is run, each in a
 process of its own. Time and memory do not depend on the weights. Parity is, if anything, worse than with trained ones,
@@ -29,6 +29,7 @@ from ..model.networks import Network, build
 from ..runtime.errors import InputError, exit_on_input_error
 from ..runtime.scene_frame import SceneFrame
 from ..runtime.session import CPU
+from ..runtime.terminal import run, say
 from .bench import thread_environment
 from .bench_worker import Failed, Prepared, Worker, Workload, example_arrays, exported
 
@@ -94,11 +95,11 @@ def table(
     for name in presets or []:
         if name not in RELEASED:
             raise InputError(f"{name}: unknown preset; choose of {', '.join(RELEASED)}")
-    print("| " + " | ".join(COLUMNS) + " |\n|" + "---|" * len(COLUMNS))
+    say("| " + " | ".join(COLUMNS) + " |", "|" + "---|" * len(COLUMNS))
     with thread_environment(1):
         for name in presets or RELEASED:
             try:
-                print(row(name, measure(name, repeats)), flush=True)
+                say(row(name, measure(name, repeats)))
             except Failed as error:
                 raise InputError(f"{name}: {error}") from None
 
@@ -210,7 +211,7 @@ def draw(network: Network, seed: int = 0) -> None:
 
 def main() -> None:
     """Run the command."""
-    typer.run(table)
+    run(table)
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ import numpy as np
 
 from ..runtime.cameras import check_intrinsics, invert_rigid, located
 from ..runtime.errors import InputError
+from ..runtime.files import check_regular, read_bytes
 from ..runtime.images import cover, fit
 from .cases import Case, Posed
 
@@ -44,9 +45,9 @@ class Entry:
 def read_index(path: Path) -> dict[str, Entry]:
     """The scenes of a published evaluation index that are not left out; raises InputError if it is none, or empty."""
     try:
-        content = json.loads(path.read_bytes())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); expected an evaluation index") from None
+        content = json.loads(read_bytes(path, "an evaluation index"))
+    except InputError:
+        raise
     except ValueError as error:
         raise InputError(f"{path}: is not valid JSON ({error}); expected an evaluation index") from None
     if not isinstance(content, dict):
@@ -82,6 +83,7 @@ def read_chunk(path: Path) -> list[dict[str, Any]]:
         raise InputError(f"{path}: PyTorch is needed to read chunks, and is not installed; {INSTALL}")
     import torch
 
+    check_regular(path)
     try:
         with warnings.catch_warnings(action="ignore"):  # torch warns of what it is about to refuse
             scenes = torch.load(path, map_location="cpu", weights_only=True)

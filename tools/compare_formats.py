@@ -1,6 +1,6 @@
 """What each splat format costs and keeps: bytes, seconds, and the picture drawn from what comes back.
 
-python -m idesplat.tools.compare_formats --gaussians 131072
+python -P -m idesplat.tools.compare_formats --gaussians 131072
 """
 
 import tempfile
@@ -15,6 +15,7 @@ from ..runtime.drawing import draw_view
 from ..runtime.errors import exit_on_input_error
 from ..runtime.formats import FORMATS, read_scene, write_scene
 from ..runtime.gaussians import Gaussians
+from ..runtime.terminal import run, say
 from .metrics import psnr
 
 VIEWS = 2
@@ -51,7 +52,7 @@ def compare(gaussians: Annotated[int, typer.Option(help="How many.", min=100)] =
     """Print processor seconds to write and to read, megabytes, and PSNR of the picture for each format."""
     scene = made_up_scene(gaussians)
     drawn = _draw(scene)
-    print(f"{len(scene):,} Gaussians\n{'format':16}{'write, s':>10}{'read, s':>10}{'MB':>8}{'PSNR, dB':>10}")
+    say(f"{len(scene):,} Gaussians", f"{'format':16}{'write, s':>10}{'read, s':>10}{'MB':>8}{'PSNR, dB':>10}")
     with tempfile.TemporaryDirectory() as folder:
         for suffix in FORMATS:
             path = Path(folder) / f"scene{suffix}"
@@ -62,7 +63,7 @@ def compare(gaussians: Annotated[int, typer.Option(help="How many.", min=100)] =
             read = time.process_time()
             quality = psnr(_draw(back), drawn, np.ones(drawn.shape[:2], bool))
             megabytes = path.stat().st_size / 1e6
-            print(f"{suffix:16}{written - started:10.2f}{read - written:10.2f}{megabytes:8.1f}{quality:10.1f}")
+            say(f"{suffix:16}{written - started:10.2f}{read - written:10.2f}{megabytes:8.1f}{quality:10.1f}")
 
 
 def _draw(scene: Gaussians) -> np.ndarray:
@@ -75,7 +76,7 @@ def _draw(scene: Gaussians) -> np.ndarray:
 
 def main() -> None:
     """Run the command."""
-    typer.run(compare)
+    run(compare)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """The main job on a scene drawn here: photographs and cameras, and what the carried model makes of them.
 
-python -m idesplat.tools.demo demo
+python -P -m idesplat.tools.demo demo
 """
 
 from pathlib import Path
@@ -10,15 +10,20 @@ import typer
 
 from ..runtime.cli import infer
 from ..runtime.errors import exit_on_input_error
-from ..runtime.files import make_folder
+from ..runtime.outputs import Overwrite, guards_outputs, outputs
+from ..runtime.terminal import run
 from .make_scene import make_scene
 
 
 @exit_on_input_error
-def demo(out: Annotated[Path, typer.Argument(help="Folder for everything.")] = Path("demo")) -> None:
+@guards_outputs("demo")
+def demo(
+    out: Annotated[Path, typer.Argument(help="Folder for everything.")] = Path("demo"), overwrite: Overwrite = False
+) -> None:
     """Draw a room, and turn two photographs of it into splats, depth maps and views."""
-    scene = make_folder(out) / "scene"
-    make_scene(scene, seed=2, views=8, height=480, width=640)
+    scene = out / "scene"
+    outputs().writes("", [out / "scene.ply", out / "summary.json"])
+    make_scene(scene, seed=2, views=8, height=480, width=640, overwrite=overwrite)
     infer(
         images=[scene / "images"],
         cameras=str(scene / "transforms.json"),
@@ -27,12 +32,13 @@ def demo(out: Annotated[Path, typer.Argument(help="Folder for everything.")] = P
         render=out / "views",
         timings=True,
         json_path=out / "summary.json",
+        overwrite=overwrite,
     )
 
 
 def main() -> None:
     """Run the command."""
-    typer.run(demo)
+    run(demo)
 
 
 if __name__ == "__main__":

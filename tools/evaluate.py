@@ -1,6 +1,6 @@
 """The command idesplat-eval: how well an exported model draws views that it was not given, in the field's measures."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 from functools import partial
 from importlib.util import find_spec
@@ -11,8 +11,10 @@ import typer
 
 from ..runtime.default_model import default_model
 from ..runtime.errors import InputError, exit_on_input_error
-from ..runtime.files import check_writable, make_folder
+from ..runtime.input_files import camera_files, model_files
+from ..runtime.outputs import Overwrite, guards_outputs, name_files, outputs
 from ..runtime.sizes import parse_size
+from ..runtime.terminal import run, say
 
 if TYPE_CHECKING:  # nothing heavy is loaded before there is something to evaluate
     import numpy as np
@@ -43,6 +45,7 @@ app = typer.Typer(add_completion=False, no_args_is_help=True, help=__doc__)
 
 @app.command()
 @exit_on_input_error
+@guards_outputs("idesplat-eval")
 def scene(
     images: Annotated[Path, typer.Argument(help="Folder of photographs.", show_default=False)],
     cameras: Annotated[Path, typer.Option(help="Their cameras, such as a transforms.json.", show_default=False)],
@@ -58,6 +61,7 @@ def scene(
     size: Size = None,
     near: Near = None,
     far: Far = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Hold photographs out, infer from others, and compare; beside the nearest photograph and the best plane."""
     if views is not None and context:
@@ -72,13 +76,13 @@ def scene(
 
     found = find_images([images])
     frames = match(found, read_cameras(cameras, found))
-    runner = _runner(model, out)
+    runner = _runner(model, out, [*found, *camera_files(cameras)])
     count = runner.view_count(views, None, DEFAULT_VIEWS) or DEFAULT_VIEWS
     chosen = chosen_frames(frames, context or [], target or [], count, hold_out_every)
     shape = parse_size(size) if size else runner.size_for([camera for _, camera in frames])
     for sources, held_out in chosen:
         runner.check_size(len(sources), *shape)
-        print(f"held out {_names(frames, held_out)}, inferred from {_names(frames, sources)}")
+        say(f"held out {_names(frames, held_out)}, inferred from {_names(frames, sources)}")
     find_range = partial(runner.depth_range, near=near, far=far)
     cases = (load_case(frames, *numbers, shape, find_range, depth) for numbers in chosen)
     results = _evaluate(cases, len(chosen), Evaluator(runner, load_lpips()), out, pictured=len(chosen))
@@ -90,6 +94,7 @@ def scene(
 
 @app.command()
 @exit_on_input_error
+@guards_outputs("idesplat-eval")
 def chunks(
     folder: Annotated[Path, typer.Argument(help="Folder of .torch chunks.", show_default=False)],
     index: Annotated[Path, typer.Option(help="The published evaluation index (.json).", show_default=False)],
@@ -97,6 +102,7 @@ def chunks(
     model: Model = None,
     near: Near = None,
     far: Far = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Evaluate on RealEstate10K, ACID or DL3DV as the papers do: pixelSplat's chunks, a published index of frames."""
     from .chunks import NEAREST_DRAWN, chunk_cases, find_chunks, read_index
@@ -105,7 +111,7 @@ def chunks(
     from .report import print_means
 
     entries, files = read_index(index), find_chunks(folder)
-    runner = _runner(model, out)
+    runner = _runner(model, out, [index, *files])
     own = runner.description
     for views in sorted({len(entry.context) for entry in entries.values()}):
         runner.check_size(views, own.height, own.width)
@@ -120,7 +126,7 @@ def chunks(
     cases = chunk_cases(files, entries, shape, (near, far), skipped.__setitem__)
     results = _evaluate(cases, len(entries), evaluator, out, PICTURED, skipped.__setitem__)
     for key, reason in skipped.items():
-        print(f"skipped {key}: {reason}")
+        say(f"skipped {key}: {reason}")
     missing = len(entries) - len(results) - len(skipped)
     if not results:
         raise InputError(
@@ -130,13 +136,14 @@ def chunks(
     means = mean_of_scenes(results)
     print_means(means, f"{len(results)} of the index's {len(entries)} scenes, {_by(shape)}")
     if missing:
-        print(f"{missing} of the index's scenes are not in {folder}")
+        say(f"{missing} of the index's scenes are not in {folder}")
     about = {"command": "chunks", "index": str(index), "size": shape, "skipped": skipped, "missing": missing}
     _write(out, about, runner, means, results)
 
 
 @app.command()
 @exit_on_input_error
+@guards_outputs("idesplat-eval")
 def procedural(
     out: Out,
     model: Model = None,
@@ -149,6 +156,7 @@ def procedural(
         typer.Option(help="Context views there are, of which --views are given; to compare."),
     ] = None,
     size: Size = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Evaluate on the held-out procedural scenes: depth against the truth, and novel views (extra `eval`)."""
     if find_spec("numba") is None:
@@ -161,7 +169,7 @@ def procedural(
     from .report import print_means
     from .scenes import HELD_OUT_SEEDS
 
-    runner = _runner(model, out)
+    runner = _runner(model, out, [])
     shape = parse_size(size) if size else (runner.description.height, runner.description.width)
     runner.check_size(views, *shape)
     drawn = views if drawn is None else drawn
@@ -176,7 +184,7 @@ def procedural(
 
 def main() -> None:
     """Entry point of idesplat-eval."""
-    app()
+    run(app)
 
 
 def _names(frames: "list[tuple[Path, Camera]]", numbers: list[int]) -> str:
@@ -187,13 +195,21 @@ def _by(shape: tuple[int, int]) -> str:
     return f"{shape[0]}x{shape[1]}"
 
 
-def _runner(model: Path | None, out: Path) -> "Runner":
-    """The model, once it is known that results can be written."""
-    from ..runtime.runner import Runner
+def _runner(model: Path | None, out: Path, data: Sequence[Path]) -> "Runner":
+    """The model, once it is known that results can be written, and will replace nothing of the data or the user.
 
-    runner = Runner(model or default_model())
-    check_writable(make_folder(out))
-    return runner
+    Pictures are named after scenes, which may not be known yet, so any that is there counts as one to be replaced.
+    """
+    from ..runtime.runner import Runner
+    from .report import RESULTS
+
+    path = model or default_model()
+    run = outputs()
+    run.reads("the model", model_files(path))
+    run.reads("data", data)
+    run.writes_into("--out", out)
+    run.writes("--out", [out / RESULTS, *out.glob("*.png")])
+    return Runner(path)
 
 
 def _evaluate(
@@ -215,8 +231,8 @@ def _evaluate(
             if skip is None:
                 raise
             skip(case.name, str(error))
-        for target, strip in strips.items():
-            save_png(out / f"{case.name}-{Path(target).stem}.png", strip)
+        for name, strip in zip(name_files(list(strips)), strips.values(), strict=True):
+            save_png(out / f"{case.name}-{name}.png", strip)
     return results
 
 
@@ -229,5 +245,5 @@ def _write(
     path = write_results(
         out, about | {"model": {"path": str(runner.path), **asdict(runner.description)}}, means, results
     )
-    print(f"wrote {path}")
-    print(f"pictures (truth, render, error, depth, and the best plane where there is one) are beside it in {out}")
+    say(f"wrote {path}")
+    say(f"pictures (truth, render, error, depth, and the best plane where there is one) are beside it in {out}")

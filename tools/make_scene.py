@@ -1,4 +1,4 @@
-"""The command `python -m idesplat.tools.make_scene`: a procedural room as a folder of photographs, cameras and depth.
+"""The command `python -P -m idesplat.tools.make_scene`: a procedural room as photographs, cameras and depth.
 
     OUT_DIR/images/000.png ...     the photographs
     OUT_DIR/transforms.json        their cameras, as nerfstudio writes them
@@ -17,7 +17,9 @@ import numpy as np
 import typer
 
 from ..runtime.errors import exit_on_input_error
-from ..runtime.files import make_folder, replacing
+from ..runtime.files import replacing
+from ..runtime.outputs import Overwrite, guards_outputs, outputs
+from ..runtime.terminal import run, say
 
 if TYPE_CHECKING:  # compiled code is loaded only once there is something to draw
     from .scene_geometry import Layout
@@ -34,18 +36,24 @@ LAMP = 0.3  # half length of the lamp that casts shadows, in scene units
 
 
 @exit_on_input_error
+@guards_outputs("make_scene")
 def make_scene(
     out_dir: Annotated[Path, typer.Argument(help="Folder to write to.", show_default=False)],
     seed: Annotated[int, typer.Option(help="Another number gives another room.", min=0)] = SEED,
     views: Annotated[int, typer.Option(help="Photographs, along a gentle path.", min=2, max=1000)] = 8,
     height: Annotated[int, typer.Option(help="Of a photograph, in pixels.", min=16, max=8192)] = 480,
     width: Annotated[int, typer.Option(help="Of a photograph, in pixels.", min=16, max=8192)] = 640,
+    overwrite: Overwrite = False,
 ) -> None:
     """Draw photographs of a furnished room that exists only in numbers, with its cameras and exact depth."""
     from ..runtime.images_out import save_png
     from .scene_geometry import furnished_room
     from .scenes import photograph, scene_textures
 
+    images, depths, cameras = out_dir / "images", out_dir / "depth", out_dir / "transforms.json"
+    names = [f"{index:03}" for index in range(views)]
+    files = [images / f"{name}.png" for name in names] + [depths / f"{name}.npz" for name in names]
+    outputs().writes("", [*files, cameras])
     rng = np.random.default_rng(seed)
     bank = scene_textures(seed)
     layout = furnished_room(rng, bank)
@@ -53,7 +61,6 @@ def make_scene(
     scene = layout.scene._replace(light_lengths=np.where(np.arange(len(layout.scene.light_lengths)) == 0, LAMP, -1.0))
     poses = _path(rng, layout, intrinsics, views)
 
-    images, depths = make_folder(out_dir / "images"), make_folder(out_dir / "depth")
     exposure = 1.0
     for index, pose in enumerate(_with_progress(poses)):
         image, depth = photograph(scene, bank, pose, intrinsics, height, width, SAMPLES)
@@ -62,14 +69,14 @@ def make_scene(
         save_png(images / f"{index:03}.png", exposure * image)
         with replacing(depths / f"{index:03}.npz") as temporary:
             np.savez_compressed(temporary, depth=depth)
-    with replacing(out_dir / "transforms.json") as temporary:
+    with replacing(cameras) as temporary:
         temporary.write_text(json.dumps(_transforms(poses, intrinsics, width, height), indent=1) + "\n")
-    print(f"{views} photographs in {images}, their cameras in {out_dir / 'transforms.json'}, true depth in {depths}")
+    say(f"{views} photographs in {images}, their cameras in {cameras}, true depth in {depths}")
 
 
 def main() -> None:
     """Run the command."""
-    typer.run(make_scene)
+    run(make_scene)
 
 
 def _intrinsics(width: int, height: int) -> np.ndarray:

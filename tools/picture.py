@@ -1,6 +1,6 @@
 """The README's picture: what the carried model makes of two photographs of the drawn room.
 
-python -m idesplat.tools.picture demo/scene docs/picture.png
+python -P -m idesplat.tools.picture demo/scene docs/picture.png
 """
 
 from pathlib import Path
@@ -15,6 +15,7 @@ from ..runtime.drawing import draw_view
 from ..runtime.errors import exit_on_input_error
 from ..runtime.images_out import depth_colours, save_png
 from ..runtime.runner import Runner
+from ..runtime.terminal import run, say
 from ..runtime.views import prepare
 
 # Two photographs, and one between them that the model is not given.
@@ -38,12 +39,12 @@ def picture(
     between = draw_view(found.need_gaussians(), views.extrinsics[-1], pixels, width, height).rgb
     first, second, truth = views.images.transpose(0, 2, 3, 1)
     save_png(out, np.hstack([first, depth_colours(found.depth[0]), between, truth, second]).astype(np.float32))
-    print(f"wrote {out}")
+    say(f"wrote {out}")
 
 
 def main() -> None:
     """Run the command."""
-    typer.run(picture)
+    run(picture)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ..runtime.files import replacing
+from ..runtime.terminal import say
 from .novel_views import MODEL, Result, Scores
 
 RESULTS = "results.json"
@@ -57,7 +58,7 @@ def print_means(means: Scores, title: str) -> None:
         cells = ["" if other is None else _number(measure, other) for other in others]
         gains = ["" if other is None else _number(measure, value - other, sign="+") for other in others]
         table.add_row(TITLES[measure], _number(measure, value), *cells, *gains)
-    print(title)
+    say(title)
     _print(table)
 
 

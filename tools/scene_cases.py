@@ -10,6 +10,7 @@ import numpy as np
 from ..runtime.cameras import Camera, resized
 from ..runtime.depth_range import DepthRange
 from ..runtime.errors import InputError
+from ..runtime.files import check_regular
 from ..runtime.images import cover, load_image, seen_by_lens
 from ..runtime.views import Views, prepare
 from .cases import Case, Posed
@@ -148,8 +149,11 @@ def _fitted_depth(folder: Path, path: Path, camera: Camera, height: int, width: 
     if camera.distortion is not None:
         raise InputError(f"{path}: has lens distortion; true depth can only be compared for undistorted photographs")
     try:
+        check_regular(file)
         with np.load(file) as content:
             depth = content["depth"]
+    except InputError:
+        raise
     except (OSError, ValueError, KeyError) as error:
         raise InputError(f"{file}: no readable depth ({error}); expected what make_scene writes") from None
     shape = load_image(path).shape[:2]

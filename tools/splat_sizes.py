@@ -1,6 +1,6 @@
 """How large a pixel's splat should be: PSNR by size, of views as large as the photographs and closer.
 
-    python -m idesplat.tools.splat_sizes --scenes 24
+    python -P -m idesplat.tools.splat_sizes --scenes 24
 
 Small splats hide little of their neighbours and are best at the photographs' own size; seen closer they leave gaps.
 """
@@ -19,6 +19,7 @@ from ..runtime.default_model import default_model
 from ..runtime.errors import exit_on_input_error
 from ..runtime.gaussians import Gaussians
 from ..runtime.runner import Runner
+from ..runtime.terminal import run
 from .baselines import SPLAT_PIXELS, splats_at
 from .cases import Case, procedural_case
 from .metrics import psnr
@@ -67,4 +68,4 @@ def _psnr(gaussians: Gaussians, case: Case, view: int) -> float:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run(main)

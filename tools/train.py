@@ -16,6 +16,8 @@ import typer
 
 from ..runtime.errors import InputError, exit_on_input_error
 from ..runtime.files import make_folder
+from ..runtime.outputs import Overwrite, guards_outputs, outputs
+from ..runtime.terminal import run, say
 from .curriculum import Objective, Phase, curriculum, phase_at, rate_at
 
 if TYPE_CHECKING:  # torch and compiled code are loaded only once there is something to train
@@ -51,6 +53,7 @@ class Settings:
 
 
 @exit_on_input_error
+@guards_outputs("idesplat-train")
 def train(
     out: Annotated[Path, typer.Option(help="Folder for checkpoint, log and pictures; a run in it is resumed.")],
     preset: Annotated[str, typer.Option(help="The network, one of the IDESplat presets.")] = "idesplat-tiny",
@@ -71,11 +74,13 @@ def train(
     threads: Annotated[int, typer.Option(help="torch's threads; drawing scenes takes a share of another.", min=1)] = 1,
     save_every: Annotated[float, typer.Option(help="Minutes between checkpoints.", min=0)] = 3.0,
     validate_every: Annotated[int, typer.Option(help="Steps between validations.", min=1)] = 200,
+    overwrite: Overwrite = False,
 ) -> None:
     """Train IDESplat on procedural scenes with exact depth and cameras, or on photographs."""
     start, folders = str(init.resolve()) if init else "", [str(folder.resolve()) for folder in data or []]
     settings = Settings(preset, objective.value, gradual, steps, batch, size, lr, vit_lr, seed, start, folders)
     config = _config(settings)
+    _announce(out, init, data or [])
     _keep_memory()
     import torch
 
@@ -126,8 +131,8 @@ class Run:
             scenes.close()
         self.save()
         folder = self.folder
-        print(f"{folder / CHECKPOINT}: the trained network, for idesplat-export; {folder / LOG}: every step")
-        print(f"{folder / CURVES} and {folder / PICTURES}: curves, and photograph, truth, prediction and error")
+        say(f"{folder / CHECKPOINT}: the trained network, for idesplat-export; {folder / LOG}: every step")
+        say(f"{folder / CURVES} and {folder / PICTURES}: curves, and photograph, truth, prediction and error")
 
     def phase(self, step: int) -> Phase:
         """The phase of a step, counted from 0."""
@@ -212,6 +217,22 @@ def _config(settings: Settings) -> "IDESplatConfig":
     return config
 
 
+def _announce(out: Path, init: Path | None, data: list[Path]) -> None:
+    """Say what is read and written; raises InputError if a run in `out` would replace an input or a file of the user.
+
+    A checkpoint in `out` is resumed, which fails unless it is this run's, and then so are the files beside it.
+    """
+    from ..runtime.input_files import camera_files, given_images
+
+    run = outputs()
+    run.reads("the checkpoint to start from", [init] if init else [])
+    for folder in data:
+        run.reads("a photograph", given_images([folder, folder / "images"]))
+        run.reads("the cameras", camera_files(folder))
+    files = [out / name for name in (CHECKPOINT, LOG, CURVES, PICTURES)]
+    run.writes("--out", files, known=(out / CHECKPOINT).exists())
+
+
 def _source(settings: Settings, config: "IDESplatConfig") -> "Callable[[Order], Views]":
     """What draws the scenes: the given folders, or else the procedural ones."""
     if not settings.data:
@@ -233,7 +254,7 @@ def _keep_memory() -> None:
 
 def main() -> None:
     """Run the command."""
-    typer.run(train)
+    run(train)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from ..model.checkpoint import CheckpointError, fill, read_state_dict
 from ..model.config import IDESplatConfig
 from ..model.idesplat import IDESplat
 from ..runtime.errors import InputError
-from ..runtime.files import replacing
+from ..runtime.files import check_regular, replacing
 from .initialisation import new_model
 from .sparse_products import with_compiled_products
 
@@ -87,6 +87,7 @@ class TrainingState:
 
     def resume(self, path: Path, settings: dict[str, Any]) -> None:
         """Go on from a checkpoint of the same run; raises InputError for one of another run or none at all."""
+        check_regular(path)
         try:
             content = torch.load(path, weights_only=True)
             training: dict[str, Any] = content["training"]
