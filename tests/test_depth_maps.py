@@ -11,7 +11,7 @@ import trimesh
 from conftest import run_command
 from idesplat.runtime.cameras import Camera, write_cameras
 from idesplat.runtime.cli import main
-from idesplat.runtime.colmap_workspace import normals_of, write_workspace
+from idesplat.runtime.colmap_workspace import normals_of, workspace_files, write_workspace
 from idesplat.runtime.depth_maps import write_depth_maps
 from idesplat.runtime.images import cover
 from idesplat.runtime.runner import Prediction
@@ -118,6 +118,7 @@ def test_colmap_fuses_the_workspace(tmp_path: Path) -> None:
     stems = [Path(name).stem for name in views.names]
     written = write_workspace(tmp_path, stems, prediction, views)
     assert all(path.is_file() for path in written)
+    assert set(written) <= set(workspace_files(tmp_path, stems))
     pycolmap.stereo_fusion(tmp_path / "fused.ply", tmp_path, output_type="PLY")
     fused = trimesh.load(tmp_path / "fused.ply")
     points, colours = np.asarray(fused.vertices), np.asarray(fused.colors)[:, :3]
