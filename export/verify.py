@@ -146,7 +146,8 @@ def _errors(
     stage: str, names: Iterable[str], found: dict[str, np.ndarray], case: Case, bounds: Figures
 ) -> Iterator[TensorError]:
     for name in names:
-        figures, largest = _figures(name, found[name], case.tensors[name], case.views)
+        with np.errstate(all="ignore"):  # NaN and infinity are no figure within a bound
+            figures, largest = _figures(name, found[name], case.tensors[name], case.views)
         yield TensorError(case.name, stage, name, figures, bounds, largest)
 
 
