@@ -26,8 +26,8 @@ def room_inputs(views: int, height: int, width: int, near: float, far: float) ->
 def with_room(inputs: dict[str, Tensor], unit: float) -> dict[str, Tensor]:
     """The same inputs with images of the room, ray cast from their cameras: every view shows the same scene."""
     extrinsics, intrinsics = (inputs[name].double().numpy() for name in ("extrinsics", "intrinsics"))
-    size = inputs["images"].shape[2:]
-    images = [_render(pose, k, *size, unit) for pose, k in zip(extrinsics, intrinsics, strict=True)]
+    height, width = inputs["images"].shape[2:]
+    images = [_render(pose, k, height, width, unit) for pose, k in zip(extrinsics, intrinsics, strict=True)]
     return inputs | {"images": torch.from_numpy(np.stack(images))}
 
 
