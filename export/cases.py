@@ -14,13 +14,14 @@ from torch import Tensor
 
 from ..runtime.bundle import Description
 from .exporter import Fixed
-from .room import room_inputs
+from .room import room_inputs, with_room
 from .stages import NamedTensors, example_inputs
 
 # Where views are not fixed; more than `ORDERED_VIEWS` of model/geometry.py, and more than a view has neighbours.
 MOST_VIEWS_OF_A_CASE = 5
 # By how much the views' focal lengths, principal points and depth ranges differ.
 FOCAL_SPREAD, CENTRE_SPREAD, NEAR_SPREAD = 0.15, 0.04, 0.3
+NEARER = 0.8  # a near end over the trained one
 # Far over near, from the first view to the last: so little that the far end counts in inverse depths.
 LEAST_RANGE, LARGEST_RANGE = 3.0, 6.0
 
@@ -43,8 +44,9 @@ def verification_cases(network: NamedTensors, description: Description, fixed: F
     yield _case(network, "room", room)
     noise = example_inputs(fixed.views or MOST_VIEWS_OF_A_CASE, *across, near, far)
     yield _case(network, "noise", different_cameras(noise))
-    small_room = room_inputs(fixed.views or 3, *upright, 0.8 * near, far)
-    yield _case(network, "room", different_cameras(small_room))
+    nearer = NEARER * near
+    cameras = different_cameras(example_inputs(fixed.views or 3, *upright, nearer, far))
+    yield _case(network, "room", with_room(cameras, nearer))
 
 
 def different_cameras(inputs: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -14,7 +14,7 @@ LEGEND = (
     "median: of the worst channel of the worst view; 99 % and 99.9 %: percentiles of the worst view. "
     "A stage passes if each is within its bound; shown is the one that comes closest to it."
 )
-UNKNOWN_WIDTH = 120  # of what is no terminal
+SUMMARY_WIDTH, DETAILS_WIDTH = 120, 170  # where it is not a terminal's
 
 
 def print_summary(errors: Sequence[TensorError]) -> None:
@@ -33,7 +33,7 @@ def print_summary(errors: Sequence[TensorError]) -> None:
         numbers = (f"{values[figure]:.1e}" for values in (worst.errors, worst.bounds))
         name = worst.tensor.removeprefix(f"{stage}.")
         table.add_row(stage, checked, name, worst.case, FIGURE_NAMES[figure], *numbers, _verdict(worst))
-    _console().print(table)
+    _console(SUMMARY_WIDTH).print(table)
 
 
 def print_details(errors: Sequence[TensorError]) -> None:
@@ -47,12 +47,12 @@ def print_details(errors: Sequence[TensorError]) -> None:
     for row in errors:
         figures = (f"{error:.1e} / {bound:.0e}" for error, bound in zip(row.errors, row.bounds, strict=True))
         table.add_row(row.case, row.stage, row.tensor, *figures, f"{row.largest:.1e}", _verdict(row))
-    _console().print(table)
+    _console(DETAILS_WIDTH).print(table)
 
 
 def _verdict(error: TensorError) -> str:
     return "ok" if error.passed else "MISMATCH"
 
 
-def _console() -> Console:
-    return Console(width=None if sys.stdout.isatty() else UNKNOWN_WIDTH)
+def _console(width: int) -> Console:
+    return Console(width=None if sys.stdout.isatty() else width)

@@ -6,31 +6,36 @@ from torch import Tensor
 
 from .stages import example_inputs
 
-# The room: half its width and height, and the depth of its back wall, in units of the near end.
+# The room: half its width and height, and the depth of its back wall, in a unit that is the near end of the depths.
 HALF_WIDTH, HALF_HEIGHT, BACK = 5.0, 3.0, 16.0
 # Spheres in it: x, y, z, radius; y points down.
 SPHERES = ((-1.2, 0.8, 5.0, 1.0), (1.6, 1.4, 7.0, 1.5), (0.3, -0.6, 10.0, 1.2))
 LIGHT = (0.4, -0.8, -0.45)
 AMBIENT = 0.4
 # Texture: waves of random direction, mostly grey, whose amplitude falls with the frequency, as in photographs.
-WAVES, LOWEST_FREQUENCY, HIGHEST_FREQUENCY = 48, 0.4, 24.0  # radians in a unit of the near end
+WAVES, LOWEST_FREQUENCY, HIGHEST_FREQUENCY = 48, 0.4, 24.0  # radians in a unit
 CONTRAST, COLOURFULNESS, DECAY = 0.12, 0.35, 0.5
 LEVELS = 255  # of an image file
 
 
 def room_inputs(views: int, height: int, width: int, near: float, far: float) -> dict[str, Tensor]:
-    """The cameras of `example_inputs` in a textured room with spheres, ray cast: every view shows the same scene."""
-    inputs = example_inputs(views, height, width, near, far)
+    """The cameras of `example_inputs` in the room."""
+    return with_room(example_inputs(views, height, width, near, far), near)
+
+
+def with_room(inputs: dict[str, Tensor], unit: float) -> dict[str, Tensor]:
+    """The same inputs with images of the room, ray cast from their cameras: every view shows the same scene."""
     extrinsics, intrinsics = (inputs[name].double().numpy() for name in ("extrinsics", "intrinsics"))
-    images = [_render(pose, k, height, width, near) for pose, k in zip(extrinsics, intrinsics, strict=True)]
+    height, width = inputs["images"].shape[2:]
+    images = [_render(pose, k, height, width, unit) for pose, k in zip(extrinsics, intrinsics, strict=True)]
     return inputs | {"images": torch.from_numpy(np.stack(images))}
 
 
-def _render(pose: np.ndarray, intrinsics: np.ndarray, height: int, width: int, near: float) -> np.ndarray:
+def _render(pose: np.ndarray, intrinsics: np.ndarray, height: int, width: int, unit: float) -> np.ndarray:
     """The image [3, height, width] in [0, 1] from a camera-to-world pose and normalised intrinsics."""
     x, y = np.meshgrid((np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height)
     rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(intrinsics).T @ pose[:3, :3].T
-    origin = pose[:3, 3] / near
+    origin = pose[:3, 3] / unit
     points, normals = _first_hits(origin, rays)
     shade = AMBIENT + (1 - AMBIENT) * np.abs(normals @ np.array(LIGHT))
     image = np.clip(_texture(points) * shade[..., None], 0, 1)
@@ -40,7 +45,7 @@ def _render(pose: np.ndarray, intrinsics: np.ndarray, height: int, width: int, n
 def _first_hits(origin: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where rays [h, w, 3] from a point in the room meet it first, and the surface's normals there."""
     walls = np.array([HALF_WIDTH, HALF_HEIGHT, BACK])
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):
         distances = (np.sign(rays) * walls - origin) / rays
     axis = np.where(np.isfinite(distances), distances, np.inf).argmin(-1)
     distance = np.take_along_axis(distances, axis[..., None], -1)[..., 0]
