@@ -12,7 +12,9 @@ import pytest
 import torch
 from conftest import run_command
 from idesplat.runtime import Gaussians, Runner, rasterize, read_cameras, runner
+from idesplat.runtime.files import replacing
 from idesplat.runtime.images import find_images, fit, load_image
+from idesplat.runtime.outputs import Outputs
 from idesplat.runtime.views import match
 from idesplat.tools import evaluate
 from idesplat.tools.cases import procedural_case
@@ -235,7 +237,8 @@ def test_bad_input_is_one_line_and_leaves_nothing(name: str, workplace: Path, ca
     spoil, arguments, expected = BAD[name]
     spoil()
     Path("out").mkdir()
-    Path("out/results.json").write_bytes(b"the result of yesterday")
+    with Outputs("idesplat-eval"), replacing(Path("out/results.json")) as temporary:
+        temporary.write_bytes(b"the result of yesterday")
     before = {path: path.stat().st_mtime_ns for path in workplace.rglob("*")}
     assert run_command(main, *arguments) == 2
     lines = [line for line in capfd.readouterr().err.splitlines() if line.startswith("error: ")]

@@ -147,7 +147,7 @@ ERRORS = {
     "missing": (["none.ckpt", "out.onnx"], "no such file"),
     "no output": (["weights.pth"], "nothing to write"),
     "wrong suffix": (["weights.pth", "out.bin"], "must end in .onnx"),
-    "no folder": (["weights.pth", "nowhere/out.onnx"], "cannot write into nowhere"),
+    "no folder": (["weights.pth", "weights.pth/out.onnx"], "weights.pth is not a folder"),
     "unknown preset": (["weights.pth", "out.onnx", "--preset", "nonsense"], "choose one of"),
     "does not fit": (["weights.pth", "out.onnx", "--preset", "idesplat-re10k"], "does not fit"),
     "not a checkpoint": (["text.pth", "out.onnx"], "text.pth"),

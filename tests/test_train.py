@@ -332,7 +332,7 @@ def test_bad_inputs_are_one_line_each(finished: Path, tmp_path: Path, capsys: py
     assert "not a checkpoint of a training run" in refused(capsys, out=tmp_path)
     torch.save({"state_dict": {}}, tmp_path / CHECKPOINT)
     assert "not a checkpoint of a training run" in refused(capsys, out=tmp_path)
-    assert "cannot create the folder" in refused(capsys, out=tmp_path / CHECKPOINT / "below")
+    assert "is not a folder" in refused(capsys, out=tmp_path / CHECKPOINT / "below")
     assert not out.exists() or not list(out.iterdir())
 
 

@@ -224,7 +224,7 @@ def elsewhere(camera: Camera) -> Camera:
 
 REFUSED = {
     "a page that is none": (("scene.ply", "--html", "scene.ply"), "ends in .html"),
-    "a page in no folder": (("scene.ply", "--html", "nowhere/scene.html"), "cannot write into nowhere"),
+    "a page in no folder": (("scene.ply", "--html", "scene.ply/page.html"), "scene.ply is not a folder"),
     "photographs without cameras": (("scene.ply", "--images", "photographs"), "give --cameras"),
     "cameras of another scene": (("scene.ply", "--cameras", "elsewhere.json", "--html", "x.html"), "sees nothing"),
     "no scene": (("nothing.ply",), "nothing.ply"),
