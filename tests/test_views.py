@@ -193,7 +193,7 @@ def every_pair_scored(cameras, distances):
 
 
 def captures(count, seed=0):
-    """Cameras around an object, on a dome, in a grid from the air, walking ahead, anywhere, [cameras, 4, 4] each."""
+    """Poses around an object, on a dome, in a grid from the air, walking ahead, and anywhere, [cameras, 4, 4] each."""
     rng = np.random.default_rng(seed)
 
     def look(position, target):
