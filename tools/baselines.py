@@ -19,7 +19,7 @@ FEWEST_PLANES, MOST_PLANES = 64, 1024
 BEYOND = 2
 KEPT = 3
 CLOSER = 8
-# One of so many pixels a side judges the planes: all of them, those around the best, and those around the best of these.
+# One of so many pixels a side judges all planes, then those around the best ones, then those around the best of these.
 STRIDES = (4, 2, 1)
 TINY = 1e-9
 # Splats by rule: their standard deviation in pixels, and their opacity. Smaller ones hide less of their neighbours and

@@ -87,26 +87,6 @@ RECIPES = (
         "dense/0/sparse",
     ),
     Recipe(
-        "desk",
-        "room",
-        "desk with two screens",
-        "none stated",
-        "Pradyumnak777/cv2-project-2",
-        "a16030a4e454ae1c1f632cdf0798d28225f77a1f",
-        "images",
-        ESTIMATED,
-    ),
-    Recipe(
-        "workroom",
-        "room",
-        "office with desks and chairs, white walls",
-        "none stated",
-        "antoniocarevic/diplomski123",
-        "e334a3c8dcbb2dd9c3050eff0b508d620d3f29ba",
-        "images",
-        ESTIMATED,
-    ),
-    Recipe(
         "fruit",
         "object",
         "apple and banana on quilted cloth",
@@ -157,27 +137,6 @@ RECIPES = (
         ESTIMATED,
     ),
     Recipe(
-        "building",
-        "facade",
-        "white university buildings, lawn, sky",
-        "none stated",
-        "ledionkalludra/LoD2to3",
-        "88502cefc0655344eb9a83b8163512b3d24a2140",
-        "data/images",
-        ESTIMATED,
-    ),
-    Recipe(
-        "truck",
-        "outdoors",
-        "Tanks and Temples: lorry in a street",
-        "Tanks and Temples (non-commercial)",
-        "tamochaman-nu/gaussian-splatting",
-        "383ee4f4f1648134b2d41f3ce3eef980782c85db",
-        "data/tandt/truck/images",
-        ESTIMATED,
-        step=3,
-    ),
-    Recipe(
         "rails",
         "outdoors",
         "rails on concrete slabs and tiles",
@@ -207,6 +166,7 @@ RECIPES = (
         "30655651735acc321cbe9e9eb7560c7c9295a57a",
         "images",
         ESTIMATED,
+        step=3,
     ),
 )
 
@@ -421,6 +381,7 @@ def _extend(views: list[int], between: list[int], cost: np.ndarray, places: np.n
 
 
 def camera_entries(cameras: Sequence[Camera]) -> dict[str, Any]:
+    """The fields `lenses` and `frames` of a capture."""
     lenses: list[dict[str, Any]] = []
     frames = []
     for camera in cameras:
