@@ -106,9 +106,9 @@ def test_scene_measures_what_the_library_gives(workplace: Path, opened: Runner, 
 
 def test_scene_without_names_says_what_was_chosen(workplace: Path, capsys: Capture) -> None:
     assert run_command(main, *SCENE, "--views", "3") == 0
-    assert "held out 002.png, inferred from 000.png, 001.png, 003.png" in capsys.readouterr().out
+    assert "held out 000.png, inferred from 001.png, 002.png, 003.png" in capsys.readouterr().out
     (only,) = results()["scenes"]
-    assert only["context"] == ["000.png", "001.png", "003.png"] and only["depth"] == {}
+    assert only["context"] == ["001.png", "002.png", "003.png"] and only["depth"] == {}
 
 
 def test_chunks_give_the_papers_means(workplace: Path, opened: Runner, capsys: Capture) -> None:

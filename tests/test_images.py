@@ -175,7 +175,7 @@ def test_what_cannot_be_read(tmp_path):
         ("text.jpg", "damaged"),
         ("empty.jpg", "empty.jpg: is empty"),
         ("absent.jpg", "cannot be read"),
-        (".", "cannot be read"),
+        (".", "is a folder"),
     ):
         with pytest.raises(InputError, match=expected):
             load_image(tmp_path / name)

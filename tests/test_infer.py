@@ -274,8 +274,8 @@ def without_fields(content, *names):
 
 BAD = {
     "missing image folder": (nothing, ("--images", "nowhere"), "nowhere"),
-    "unreadable image": (lambda: Path("images/000.png").write_bytes(b"not a picture"), (), "000.png"),
-    "empty image": (lambda: Path("images/000.png").write_bytes(b""), (), "000.png"),
+    "unreadable image": (lambda: Path("images/000.png").write_bytes(b"not a picture"), ("--frames", "0,1"), "000.png"),
+    "empty image": (lambda: Path("images/000.png").write_bytes(b""), ("--frames", "0,1"), "000.png"),
     "corrupt JSON": (lambda: Path("transforms.json").write_text('{"frames": ['), (), "transforms.json"),
     "missing cameras": (nothing, ("--cameras", "none.json"), "none.json"),
     "missing pose": (change_cameras(lambda c: c["frames"][0].pop("transform_matrix")), (), "transform_matrix"),

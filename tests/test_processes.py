@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -229,7 +230,9 @@ run(wait)
 def test_signals_clean_up(tmp_path, number, status):
     out = tmp_path / "out.txt"
     command = [sys.executable, "-P", "-c", WAITING, out]
-    waiting = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    # A shell starts commands in the background with SIGINT ignored, and what is ignored stays so.
+    usual = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    waiting = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=usual)
     assert waiting.stdout.readline() == "waiting\n"
     waiting.send_signal(number)
     printed = waiting.communicate(timeout=60)

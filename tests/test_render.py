@@ -10,6 +10,7 @@ import av
 import cv2
 import numpy as np
 import pytest
+from conftest import run_command
 from idesplat.runtime import render, video_out
 from idesplat.runtime.cameras import Camera, write_cameras
 from idesplat.runtime.drawing import draw_view
@@ -52,12 +53,9 @@ def read_rgb(path: Path) -> np.ndarray:
     return cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[..., ::-1]
 
 
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+def run(_: pytest.MonkeyPatch, *arguments: object) -> int:
     """Exit status of the command with these arguments."""
-    monkeypatch.setattr(sys, "argv", ["idesplat-render", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    return stopped.value.code or 0
+    return run_command(main, *arguments)
 
 
 def test_draws_every_camera_at_its_own_size(
@@ -363,8 +361,7 @@ def test_a_path_through_the_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (("--out", "a.png", "--cameras", "cameras.json"), "2 pictures do not fit one file"),
         (("--out", "a.png", "--orbit"), "90 pictures do not fit one file"),
         (("--out", "scene.ply/a.mp4"), "scene.ply is not a folder"),
-        (("--out", "out", "--size", "9000x9000"), "a picture of 9000 x 9000 pixels would take 4.5 GB"),
-        (("--out", "a.mp4", "--orbit", "--size", "5000x70000"), "sides of 65,536 at most"),
+        (("--out", "out", "--size", "9000x9000"), "sides of 8192 pixels at most"),
         (("--out", "out", "--orbit", "--frames", "10001"), "--frames 10001: expected 1 to 10000"),
         (("--out", "a.mp4", "--orbit", "--frames", "0"), "--frames 0: expected 1 to 10000"),
         (("--out", "a.jpg"), "--out a.jpg: expected a folder, or a file that ends in .png or .mp4"),
@@ -382,6 +379,26 @@ def test_requests_that_make_no_picture(
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
     assert {path.name for path in tmp_path.iterdir()} == {"scene.ply", "cameras.json"}
+
+
+def test_cameras_of_a_picture_too_large_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    write_ply(tmp_path / "scene.ply", a_ball_of_gaussians())
+    for width, height, message in ((9000, 9000, "would take 4.5 GB"), (5, 70_000, "sides of 65,536 at most")):
+        camera = Camera(
+            "a",
+            width,
+            height,
+            np.array([[width, 0, width / 2], [0, height, height / 2], [0, 0, 1.0]]),
+            pose((0, 0, 0), (1, -2, 0)),
+        )
+        write_cameras(tmp_path / "cameras.json", [camera])
+        options = ("--cameras", tmp_path / "cameras.json", "--out", tmp_path / "out", "--overwrite")
+        assert run(monkeypatch, tmp_path / "scene.ply", *options) == 2
+        error = capsys.readouterr().err
+        assert message in error and error.count("\n") == 1
+        assert not (tmp_path / "out").exists()
 
 
 def test_a_depth_picture_never_overwrites_another_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,11 +26,14 @@ from idesplat.model.config import (
     ViTConfig,
 )
 from idesplat.model.idesplat import IDESplat
+from idesplat.runtime.cameras import Camera
 from idesplat.runtime.errors import EXIT_STATUS, InputError
-from idesplat.tools import losses, train
+from idesplat.runtime.views import Views, prepare
+from idesplat.tools import losses, train, training_folders
 from idesplat.tools.baselines import SPLAT_PIXELS
 from idesplat.tools.curriculum import Objective, Phase, curriculum, phase_at, rate_at
 from idesplat.tools.initialisation import new_model
+from idesplat.tools.make_scene import make_scene
 from idesplat.tools.train import CHECKPOINT, CURVES, LOG, PICTURES, Run, Settings
 from idesplat.tools.training_data import Order, drawn_ahead, training_order
 from idesplat.tools.training_folders import FolderScenes
@@ -360,8 +363,42 @@ def test_folders_are_drawn_from_as_ordered(scene: Path) -> None:
     shown = shown[:, top : top + 64, left : left + 96]
     assert torch.equal(first.images, closer.images) and (left > 0 or top > 0)
     assert (closer.target_images[0] - shown).abs().mean() < 0.05
-    with pytest.raises(InputError, match="5 photographs, expected at least 6"):
-        scenes.draw(Order(5, 4, (1, 2), 64, 96))
+    assert len(scenes.draw(Order(5, 4, (1, 2), 64, 96)).images) == 2  # of the 4 photographs that are not held out
+
+
+def test_validation_renders_photographs_that_training_never_uses(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of five photographs, the first one is held out."""
+    used: dict[str, set[str]] = {"train": set(), "validate": set()}
+    now = "train"
+    opened = training_folders.take
+
+    def noted(pair: tuple[Path, Camera], height: int, width: int) -> tuple:
+        used[now].add(pair[0].name)
+        return opened(pair, height, width)
+
+    def noted_all(pairs: list[tuple[Path, Camera]], *rest: object) -> Views:
+        if now == "train":
+            used[now].update(path.name for path, _ in pairs)
+        return prepare(pairs, *rest)
+
+    monkeypatch.setattr(training_folders, "take", noted)
+    monkeypatch.setattr(training_folders, "prepare", noted_all)
+    settings = replace(SETTINGS, objective="photometric", data=[str(scene)])
+    run = Run(tmp_path, settings, SMALL)
+    for seed in range(40):
+        run.draw(Order(seed, 2, (1, 2), 64, 64))
+    now = "validate"
+    for seed in range(5):
+        run.draw_validation(Order(seed, 2, (1,), 64, 64))
+    assert used == {"train": {"001.png", "002.png", "003.png", "004.png"}, "validate": {"000.png"}}
+
+
+def test_folder_with_too_few_photographs_is_refused(tmp_path: Path) -> None:
+    make_scene(tmp_path, seed=2, views=4, height=32, width=48)
+    with pytest.raises(InputError, match="3 photographs to train on and 1 held out for validation, expected at least"):
+        FolderScenes([tmp_path], near=1, far=20)
 
 
 def test_folder_without_a_photograph_is_refused(scene: Path, tmp_path: Path) -> None:

@@ -19,7 +19,8 @@ FEWEST_PLANES, MOST_PLANES = 64, 1024
 BEYOND = 2
 KEPT = 3
 CLOSER = 8
-ROUNDS = 2
+# One of so many pixels a side judges all planes, then those around the best ones, then those around the best of these.
+STRIDES = (4, 2, 1)
 TINY = 1e-9
 # Splats by rule: their standard deviation in pixels, and their opacity. Smaller ones hide less of their neighbours and
 # score higher at the photographs' own size, but leave gaps when seen four times as large, as in a viewer that fills a
@@ -49,36 +50,46 @@ def best_plane(
     pixels = float(max(_distances(context, extrinsics)) * K[0, 0] * (high - low))  # that the nearest plane moves
     candidates = np.linspace(low, high, min(max(ceil(pixels), FEWEST_PLANES), MOST_PLANES) + 1)
     step = candidates[1] - candidates[0]
-    errors: dict[float, float] = {}
-    for _ in range(ROUNDS + 1):
+    for stride, kept in zip(STRIDES, (KEPT, 1, 1), strict=True):
+        judged = (slice(stride // 2, None, stride),) * 2
+        if not valid[judged].any():
+            continue
+        errors = {}
         for inverse_depth in candidates:
-            picture = warp_plane(context, extrinsics, K, inverse_depth)
-            errors[inverse_depth] = float(np.square(picture - truth)[valid].mean())
-        best = np.array(sorted(errors, key=lambda inverse_depth: errors[inverse_depth])[:KEPT])
+            picture = warp_plane(context, extrinsics, K, inverse_depth, stride)
+            errors[inverse_depth] = float(np.square(picture - truth[judged])[valid[judged]].mean())
+        best = np.array(sorted(errors, key=lambda inverse_depth: errors[inverse_depth])[:kept])
         step /= CLOSER
         around = best[:, None] + step * np.arange(1 - CLOSER, CLOSER)
-        candidates = np.setdiff1d(around.clip(low, high), list(errors))
+        candidates = np.unique(around.clip(low, high))
     return warp_plane(context, extrinsics, K, best[0]), float(1 / best[0])
 
 
-def warp_plane(context: Posed, extrinsics: np.ndarray, K: np.ndarray, inverse_depth: float) -> np.ndarray:
+def warp_plane(
+    context: Posed, extrinsics: np.ndarray, K: np.ndarray, inverse_depth: float, stride: int = 1
+) -> np.ndarray:
     """The context views as a camera sees them if all they show lies on a plane at 1 / inverse_depth before it.
 
     extrinsics: the camera's pose, [4, 4]. K: in pixels, [3, 3]. Views are mixed by their cameras' nearness, among those
     that see a pixel; where none does, the pixel of the nearest view is copied. Returns [height, width, 3] float32.
+    stride: of the picture's rows and columns, only one of so many, from `stride // 2`.
     """
-    height, width = context.valid.shape[1:]
+    judged = (slice(stride // 2, None, stride),) * 2
+    height, width = context.valid[0][judged].shape
+    # From pixels (centres at .5) of the rows and columns that are asked for, to those of the picture.
+    offset = stride // 2 + (1 - stride) / 2
+    spread = np.array([[stride, 0, offset], [0, stride, offset], [0, 0, 1]])
     weights = 1 / np.maximum(_distances(context, extrinsics), TINY)
     mixed, total = np.zeros((height, width, 3), np.float32), np.zeros((height, width, 1), np.float32)
     for view, weight in enumerate(weights / weights.sum()):
         there = np.linalg.inv(context.extrinsics[view].astype(np.float64)) @ extrinsics
         # A point of the plane in this camera: depth * (rotation + translation * normal / depth) @ ray.
         flat = there[:3, :3] + inverse_depth * there[:3, 3:] * np.array([[0, 0, 1.0]])
-        picture, seen = _warped(context, view, context.K(view) @ flat @ np.linalg.inv(K))
+        picture, seen = _warped(context, view, context.K(view) @ flat @ np.linalg.inv(K) @ spread, (height, width))
         share = (weight * seen)[..., None].astype(np.float32)
         mixed += share * picture
         total += share
-    copied = context.picture(nearest_view(context, extrinsics))
+    copied = context.picture(nearest_view(context, extrinsics))[judged]
     return np.where(total > 0, mixed / np.maximum(total, TINY), copied)
 
 
@@ -97,11 +108,14 @@ def splats_at(depth: np.ndarray, context: Posed) -> Gaussians:
     )
 
 
-def _warped(context: Posed, view: int, homography: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A view's picture under a homography from pixels (centres at .5) of the result, and where it is seen."""
+def _warped(context: Posed, view: int, homography: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """A view's picture under a homography from pixels (centres at .5) of the result, and where it is seen.
+
+    shape: height and width of the result.
+    """
     import cv2
 
-    height, width = context.valid.shape[1:]
+    height, width = shape
     half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # OpenCV's pixel centres lie at whole numbers
     maps = np.linalg.inv(half) @ homography @ half
     size, inverse = (width, height), cv2.WARP_INVERSE_MAP

@@ -11,8 +11,10 @@ import typer
 
 from ..runtime.default_model import default_model
 from ..runtime.errors import InputError, exit_on_input_error
+from ..runtime.files import scratch_folder
 from ..runtime.input_files import camera_files, model_files
 from ..runtime.outputs import Overwrite, guards_outputs, name_files, outputs
+from ..runtime.progress import progress
 from ..runtime.sizes import parse_size
 from ..runtime.terminal import run, say
 
@@ -56,7 +58,7 @@ def scene(
     views: Annotated[
         int | None, typer.Option(help="Photographs around each target, without --context; 2 by default.", min=2)
     ] = None,
-    hold_out_every: Annotated[int, typer.Option(help="Hold out one of so many, without --target.", min=2)] = 8,
+    hold_out_every: Annotated[int, typer.Option(help="Hold out frames 0, N, 2 N and on, without --target.", min=2)] = 8,
     depth: Annotated[Path | None, typer.Option(help="Folder of true depth, as make_scene writes it.")] = None,
     size: Size = None,
     near: Near = None,
@@ -182,6 +184,48 @@ def procedural(
     _write(out, {"command": "procedural", "views": views, "drawn": drawn, "size": shape}, runner, means, results)
 
 
+@app.command()
+@exit_on_input_error
+@guards_outputs("idesplat-eval")
+def captures(
+    out: Out,
+    checkouts: Annotated[
+        Path | None,
+        typer.Option(help="Folder of checkouts, each OWNER+NAME or OWNER/NAME; missing ones are cloned into it."),
+    ] = None,
+    capture: Annotated[list[str] | None, typer.Option(help="Measure this capture alone; may be repeated.")] = None,
+    views: Annotated[str, typer.Option(help="Numbers of context views, with commas; 2 are the triples.")] = "2,3,4,6",
+    model: Model = None,
+    size: Size = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Evaluate on real captures at pinned commits of public repositories, cloned where they are not given (git)."""
+    from .capture_report import print_captures, write_capture_results
+    from .capture_scores import CaptureEvaluator
+    from .captures import CaptureImages, parse_view_counts, read_captures
+    from .checkouts import clones_folder, extract, fetch_checkout
+    from .metrics import load_lpips
+
+    chosen, counts = read_captures(capture or []), parse_view_counts(views)
+    runner = _runner(model, out, [])
+    shape = parse_size(size) if size else (runner.description.height, runner.description.width)
+    for count in counts:
+        runner.check_size(count, *shape)
+    folder = checkouts or clones_folder()
+    evaluator, results = CaptureEvaluator(runner, load_lpips()), []
+    for entry in progress(chosen, "evaluating"):
+        with scratch_folder() as images:
+            checkout = fetch_checkout(folder, entry.repository, entry.commit)
+            extract(checkout, entry.commit, entry.folder, entry.frames, images)
+            loaded = CaptureImages(entry, images, shape)
+            results.append(evaluator.evaluate(entry, loaded, counts, partial(_save_strip, out)))
+    print_captures(results, counts, _by(shape))
+    about = {"command": "captures", "size": shape, "views": counts}
+    path = write_capture_results(out, about | _about(runner), results, counts)
+    say(f"wrote {path}")
+    say(f"strips (truth, render, error, depth, and for triples the best plane) are beside it in {out}")
+
+
 def main() -> None:
     """Entry point of idesplat-eval."""
     run(app)
@@ -220,7 +264,6 @@ def _evaluate(
     skip: hears of a case that the model cannot take, and why; without it that is an error.
     """
     from ..runtime.images_out import save_png
-    from ..runtime.progress import progress
 
     results: list[Result] = []
     for case in progress(cases, "evaluating", total):
@@ -236,14 +279,22 @@ def _evaluate(
     return results
 
 
+def _save_strip(out: Path, name: str, strip: "np.ndarray") -> None:
+    from ..runtime.images_out import save_png
+
+    save_png(out / f"{name}.png", strip)
+
+
+def _about(runner: "Runner") -> dict[str, Any]:
+    return {"model": {"path": str(runner.path), **asdict(runner.description)}}
+
+
 def _write(
     out: Path, about: dict[str, Any], runner: "Runner", means: dict[str, dict[str, float]], results: "list[Result]"
 ) -> None:
     """Write results.json and say what there is to look at."""
     from .report import write_results
 
-    path = write_results(
-        out, about | {"model": {"path": str(runner.path), **asdict(runner.description)}}, means, results
-    )
+    path = write_results(out, about | _about(runner), means, results)
     say(f"wrote {path}")
     say(f"pictures (truth, render, error, depth, and the best plane where there is one) are beside it in {out}")

@@ -26,6 +26,20 @@ def psnr(picture: np.ndarray, truth: np.ndarray, valid: np.ndarray) -> float:
     return min(-10 * float(np.log10(np.mean(difference**2, dtype=np.float64) + 1e-30)), HIGHEST_PSNR)
 
 
+def fit_exposure(picture: np.ndarray, truth: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """The picture after the gain and offset of each channel that bring its valid pixels closest to the truth.
+
+    Least squares on values clipped to [0, 1]. picture, truth: [height, width, 3]. valid: bool [height, width].
+    """
+    clipped = np.clip(picture, 0, 1).astype(np.float64)
+    x, y = clipped[valid], np.clip(truth[valid], 0, 1).astype(np.float64)  # [pixels, 3]
+    deviation = x - x.mean(axis=0)
+    variance = np.square(deviation).mean(axis=0)
+    covariance = (deviation * (y - y.mean(axis=0))).mean(axis=0)
+    gain = np.divide(covariance, variance, out=np.zeros(3), where=variance > 0)
+    return (gain * (clipped - x.mean(axis=0)) + y.mean(axis=0)).astype(np.float32)
+
+
 def ssim(picture: np.ndarray, truth: np.ndarray, valid: np.ndarray) -> float:
     """Structural similarity: its mean over colours and over the pixels whose whole window lies on valid pixels.
 

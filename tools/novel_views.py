@@ -90,7 +90,7 @@ class Evaluator:
             scores = {method: self._measure(picture, truth, valid, seen) for method, picture in pictures.items()}
             targets.append(Target(name, scores, details))
             if show is not None:
-                show(name, _strip(truth, valid, drawn, pictures.get(PLANE)))
+                show(name, comparison_strip(truth, valid, drawn, pictures.get(PLANE)))
         depth = {} if case.depth is None else depth_measures(prediction.depth, case.depth)
         return Result(case.name, given.names, case.near, case.far, targets, depth)
 
@@ -153,7 +153,7 @@ def _mean(entries: list[Scores]) -> Scores:
     }
 
 
-def _strip(truth: np.ndarray, valid: np.ndarray, drawn: Rendering, plane: np.ndarray | None) -> np.ndarray:
+def comparison_strip(truth: np.ndarray, valid: np.ndarray, drawn: Rendering, plane: np.ndarray | None) -> np.ndarray:
     """Truth, render, error (black where nothing is measured), depth and plane side by side."""
     error = np.abs(drawn.rgb.clip(0, 1) - truth).mean(axis=2) * valid / WORST_ERROR
     hot = cv2.applyColorMap(np.rint(255 * error.clip(0, 1)).astype(np.uint8), cv2.COLORMAP_INFERNO)

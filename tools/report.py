@@ -41,7 +41,7 @@ def print_views(results: Sequence[Result]) -> None:
         for target in result.targets:
             cells = [_number(measure, target.scores[method][measure]) for measure, method in columns]
             table.add_row(literal(target.name), literal(", ".join(result.context)), *cells)
-    _print(table)
+    print_table(table)
 
 
 def print_means(means: Scores, title: str) -> None:
@@ -59,7 +59,7 @@ def print_means(means: Scores, title: str) -> None:
         gains = ["" if other is None else _number(measure, value - other, sign="+") for other in others]
         table.add_row(TITLES[measure], _number(measure, value), *cells, *gains)
     say(title)
-    _print(table)
+    print_table(table)
 
 
 def write_results(folder: Path, about: dict[str, Any], means: Scores, results: Sequence[Result]) -> Path:
@@ -75,7 +75,8 @@ def _number(measure: str, value: float, sign: str = "") -> str:
     return f"{value:{sign}.{DECIMALS.get(measure, USUAL_DECIMALS)}f}"
 
 
-def _print(table: Table) -> None:
+def print_table(table: Table) -> None:
+    """Print a table, at a set width where there is no terminal."""
     console = Console()
     if not console.is_terminal:
         console = Console(width=WIDTH)

@@ -33,7 +33,8 @@ def chosen_frames(
     """Which frames a network is given and which it is to meet: pairs of context and targets, as numbers of frames.
 
     context, targets: file names, with suffix or without. Without targets, one of every `hold_out_every` frames is
-    held out; without a context, each target gets `views` frames of its own from those that are not held out.
+    held out, from the first one; without a context, each target gets `views` frames of its own from those that are not
+    held out.
     Raises InputError for names that no frame or several have, that are given twice, and for too few frames.
     """
     given = [_number(frames, name, "--context") for name in context]
@@ -47,7 +48,7 @@ def chosen_frames(
         if len(given) < 2:
             raise InputError(f"--context names {len(given)} frame, expected at least 2")
         return [(given, wanted)]
-    wanted = wanted or list(range(min(hold_out_every, len(frames)) // 2, len(frames), hold_out_every))
+    wanted = wanted or list(range(0, len(frames), hold_out_every))
     rest = [number for number in range(len(frames)) if number not in wanted]
     if len(rest) < views:
         raise InputError(
@@ -92,7 +93,7 @@ def load_case(
     """
     chosen = [frames[number] for number in (*context, *targets)]
     views = prepare(chosen, None, *size)
-    valid = np.stack([_valid_pixels(path, camera, *size) for path, camera in chosen])
+    valid = np.stack([valid_pixels(load_image(path), camera, *size) for path, camera in chosen])
     for name, seen in zip(views.names, valid, strict=True):
         if seen.mean() < LEAST_VALID:
             raise InputError(f"{name}: is black nearly everywhere, or its distortion wrong; expected a photograph")
@@ -123,9 +124,8 @@ def _number(frames: Sequence[Frame], name: str, option: str) -> int:
     raise InputError(f"{option} {name}: the name of {count} of {len(frames)} photographs; they are {examples}, ...")
 
 
-def _valid_pixels(path: Path, camera: Camera, height: int, width: int) -> np.ndarray:
-    """Where the prepared picture shows what the camera saw, bool [height, width]."""
-    image = load_image(path)
+def valid_pixels(image: np.ndarray, camera: Camera, height: int, width: int) -> np.ndarray:
+    """Where an image [h, w, 3], once brought to height x width, shows what its camera saw, bool [height, width]."""
     if camera.distortion is None:
         seen = ~_black_border(image)
     else:

@@ -59,7 +59,10 @@ def train(
     preset: Annotated[str, typer.Option(help="The network, one of the IDESplat presets.")] = "idesplat-tiny",
     init: Annotated[Path | None, typer.Option(help="Checkpoint to start from, released or own.")] = None,
     data: Annotated[
-        list[Path] | None, typer.Option(help="Folder with photographs and transforms.json, instead of drawn scenes.")
+        list[Path] | None,
+        typer.Option(
+            help="Folder with photographs and transforms.json, instead of drawn scenes; every eighth is for validation."
+        ),
     ] = None,
     objective: Annotated[Objective, typer.Option(help="True depth, rendered novel views, or both.")] = Objective.BOTH,
     gradual: Annotated[
@@ -106,7 +109,9 @@ class Run:
             self.state.resume(folder / CHECKPOINT, asdict(settings))
         elif settings.init:
             self.state.start_from(Path(settings.init))
-        self.draw: Callable[[Order], Views] = _source(settings, config)
+        self.draw: Callable[[Order], Views]
+        self.draw_validation: Callable[[Order], Views]
+        self.draw, self.draw_validation = _sources(settings, config)
         self.log: TrainingLog = TrainingLog(folder / LOG, self.state.step)
         renders = any(phase.gaussians for phase in self.phases)
         self.perceptual: Perceptual | None = load_perceptual() if renders else None
@@ -172,7 +177,7 @@ class Run:
 
         phase = self.phase(self.state.step - 1)
         side = self.settings.size // phase.shrink
-        found = validate(self.state.mean_model(), phase, side, self.draw, self.folder / PICTURES)
+        found = validate(self.state.mean_model(), phase, side, self.draw_validation, self.folder / PICTURES)
         self.log.draw_curves(self.folder / CURVES, CURVES_SHOWN)
         return {name: finite(value) for name, value in found.items()}
 
@@ -233,15 +238,18 @@ def _announce(out: Path, init: Path | None, data: list[Path]) -> None:
     run.writes("--out", files, known=(out / CHECKPOINT).exists())
 
 
-def _source(settings: Settings, config: "IDESplatConfig") -> "Callable[[Order], Views]":
-    """What draws the scenes: the given folders, or else the procedural ones."""
+def _sources(
+    settings: Settings, config: "IDESplatConfig"
+) -> "tuple[Callable[[Order], Views], Callable[[Order], Views]]":
+    """What draws the scenes of training and of validation: the given folders, or else the procedural ones."""
     if not settings.data:
         from .training_data import draw_views
 
-        return draw_views
+        return draw_views, draw_views
     from .training_folders import FolderScenes
 
-    return FolderScenes([Path(folder) for folder in settings.data], config.near, config.far).draw
+    scenes = FolderScenes([Path(folder) for folder in settings.data], config.near, config.far)
+    return scenes.draw, scenes.draw_held_out
 
 
 def _keep_memory() -> None:

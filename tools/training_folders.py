@@ -1,6 +1,11 @@
-"""Training scenes from folders of photographs: no true depth, but views to be drawn as they were taken."""
+"""Training scenes from folders of photographs: no true depth, but views to be drawn as they were taken.
+
+Every eighth photograph of a folder, from the first one in the order of its transforms.json, is held out: validation
+renders these from the others, and training uses none of them.
+"""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,33 +25,59 @@ CAMERAS = "transforms.json"
 # The other context views are drawn from this many cameras nearest to the first one, the targets from as many nearest
 # to the middle of the context.
 NEIGHBOURHOOD = 8
-
+# One of so many photographs is held out, from the first, as in the published splits of such captures.
+HOLD_OUT_EVERY = 8
+FEWEST_CONTEXT, FEWEST_TARGETS = 2, 2
 
 Pairs = list[tuple[Path, Camera]]
 
 
 class FolderScenes:
-    """Draws scenes from folders; the same order gives the same scene."""
+    """Draws scenes from folders; the same order gives the same scene.
+
+    for_training, held_out: the photographs of each folder with their cameras.
+    """
 
     def __init__(self, folders: Sequence[Path], near: float, far: float) -> None:
-        """Read the folders' cameras; raises InputError where cameras or photographs are missing.
+        """Read the folders' cameras; raises InputError where cameras or photographs are missing, or too few.
 
         near, far: what the network is trained for. As where it is used, scenes come in the unit that has this near.
         """
-        self.folders = [_pairs(folder) for folder in folders]
+        self.for_training: list[Pairs] = []
+        self.held_out: list[Pairs] = []
+        for folder in folders:
+            pairs = _pairs(folder)
+            self.held_out.append(pairs[::HOLD_OUT_EVERY])
+            self.for_training.append([pair for index, pair in enumerate(pairs) if index % HOLD_OUT_EVERY])
+            _check_enough(folder, len(self.for_training[-1]), len(self.held_out[-1]))
         self.trained = near, far
 
     def draw(self, order: Order) -> Views:
-        """Context views near each other, and targets near them; raises InputError where a scene is too small."""
+        """Context views near each other, and targets near them, none of them held out.
+
+        A folder with too few photographs for the order's targets and context gives fewer context views.
+        """
         rng = np.random.default_rng(order.seed)
-        pairs = self.folders[rng.integers(len(self.folders))]
-        chosen = _choose(rng, pairs, order.context, len(order.closer))
-        photographs = prepare([pairs[index] for index in chosen], None, order.height, order.width)
-        targets = [
-            _target(rng, pairs[index], closer, order)
-            for index, closer in zip(chosen[order.context :], order.closer, strict=True)
-        ]
-        return self._to_views(photographs, order.context, targets)
+        pairs = self.for_training[rng.integers(len(self.for_training))]
+        chosen = _choose(rng, pairs, len(order.closer), order.context)
+        count = len(chosen) - len(order.closer)
+        return self._views(rng, [pairs[index] for index in chosen[:count]], [pairs[i] for i in chosen[count:]], order)
+
+    def draw_held_out(self, order: Order) -> Views:
+        """Held-out photographs as targets, and those for training that were taken nearest to them as context."""
+        rng = np.random.default_rng(order.seed)
+        folder = int(rng.integers(len(self.held_out)))
+        held_out, pairs = self.held_out[folder], self.for_training[folder]
+        first = int(rng.integers(len(held_out)))
+        targets = [held_out[index] for index in _nearest(held_out, held_out[first])[: max(len(order.closer), 1)]]
+        context = [pairs[index] for index in _nearest(pairs, targets[0])[: order.context]]
+        closer = order.closer[: len(targets)]
+        return self._views(rng, context, targets[: len(closer)], replace(order, closer=closer))
+
+    def _views(self, rng: np.random.Generator, context: Pairs, targets: Pairs, order: Order) -> Views:
+        photographs = prepare([*context, *targets], None, order.height, order.width)
+        windows = [_target(rng, pair, closer, order) for pair, closer in zip(targets, order.closer, strict=True)]
+        return self._to_views(photographs, len(context), windows)
 
     def _to_views(self, photographs: Photographs, context: int, targets: Sequence[tuple[Tensor, Tensor]]) -> Views:
         given = photographs.images, photographs.extrinsics, photographs.intrinsics
@@ -86,12 +117,18 @@ def _pairs(folder: Path) -> Pairs:
     return pairs
 
 
-def _choose(rng: np.random.Generator, pairs: Pairs, context: int, targets: int) -> list[int]:
-    """Indices of context and target views."""
-    places = np.stack([camera.extrinsics[:3, 3] for _, camera in pairs])  # [cameras, 3]
-    if len(places) < context + targets:
-        found = f"{len(places)} photographs, expected at least {context + targets}"
-        raise InputError(f"{pairs[0][0].parent}: {found} to train on; add photographs or leave the folder out")
+def _check_enough(folder: Path, training: int, held_out: int) -> None:
+    if training < FEWEST_CONTEXT + FEWEST_TARGETS:
+        raise InputError(
+            f"{folder}: {training} photographs to train on and {held_out} held out for validation, expected at least "
+            f"{FEWEST_CONTEXT + FEWEST_TARGETS} to train on; add photographs or leave the folder out"
+        )
+
+
+def _choose(rng: np.random.Generator, pairs: Pairs, targets: int, context: int) -> list[int]:
+    """Indices of context views, as many as there are photographs for, and then of target views."""
+    context = min(context, len(pairs) - targets)
+    places = _places(pairs)
     chosen = [int(rng.integers(len(places)))]
     for count in (context - 1, targets):
         rest = np.setdiff1d(np.arange(len(places)), chosen)
@@ -99,3 +136,13 @@ def _choose(rng: np.random.Generator, pairs: Pairs, context: int, targets: int) 
         nearest = rest[np.argsort(distances)][: max(NEIGHBOURHOOD, count)]
         chosen += [int(index) for index in rng.choice(nearest, count, replace=False)]
     return chosen
+
+
+def _nearest(pairs: Pairs, pair: tuple[Path, Camera]) -> list[int]:
+    """Indices of pairs, those taken nearest to a photograph first."""
+    return np.argsort(np.linalg.norm(_places(pairs) - pair[1].extrinsics[:3, 3], axis=1), kind="stable").tolist()
+
+
+def _places(pairs: Pairs) -> np.ndarray:
+    """Where the cameras stand, [cameras, 3]."""
+    return np.stack([camera.extrinsics[:3, 3] for _, camera in pairs])
