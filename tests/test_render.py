@@ -386,13 +386,8 @@ def test_cameras_of_a_picture_too_large_are_refused(
 ) -> None:
     write_ply(tmp_path / "scene.ply", a_ball_of_gaussians())
     for width, height, message in ((9000, 9000, "would take 4.5 GB"), (5, 70_000, "sides of 65,536 at most")):
-        camera = Camera(
-            "a",
-            width,
-            height,
-            np.array([[width, 0, width / 2], [0, height, height / 2], [0, 0, 1.0]]),
-            pose((0, 0, 0), (1, -2, 0)),
-        )
+        K = np.array([[width, 0, width / 2], [0, height, height / 2], [0, 0, 1]])
+        camera = Camera("a", width, height, K, pose((0, 0, 0), (1, -2, 0)))
         write_cameras(tmp_path / "cameras.json", [camera])
         options = ("--cameras", tmp_path / "cameras.json", "--out", tmp_path / "out", "--overwrite")
         assert run(monkeypatch, tmp_path / "scene.ply", *options) == 2

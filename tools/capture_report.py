@@ -9,6 +9,7 @@ from typing import Any
 from rich.table import Table
 
 from ..runtime.files import replacing
+from ..runtime.terminal import say
 from .capture_scores import PAIRS, CaptureScores, mean_of_captures
 from .captures import PAIR
 from .novel_views import MODEL, NEAREST, PLANE, Scores
@@ -45,7 +46,7 @@ def print_captures(results: Sequence[CaptureScores], counts: Sequence[int], size
         having = sum(count in result.cases for result in results)
         if having:
             table.add_row(f"mean of {having}", str(count), *_cells(mean_of_captures(results, count)))
-    print(f"real captures at {size}, PSNR in dB; {PAIR} views: triples, more: the middle of a path of views")
+    say(f"real captures at {size}, PSNR in dB; {PAIR} views: triples, more: the middle of a path of views")
     print_table(table)
 
 

@@ -27,6 +27,7 @@ from ..runtime.images import SUFFIXES, load_image
 from ..runtime.matching import epipolar_error, match_features, rays_of
 from ..runtime.progress import progress
 from ..runtime.quaternions import quaternions_from_matrices
+from ..runtime.terminal import run, say
 from ..runtime.view_choice import compare
 from ..runtime.view_loader import Sample
 from ..runtime.views import match
@@ -200,7 +201,7 @@ def choose_captures(
             entries[recipe.name] = _choose(recipe, checkouts, work)
             with replacing(CAPTURES_FILE) as temporary:
                 temporary.write_text(as_json([entries[name] for name in order if name in entries]))
-    print(f"wrote {CAPTURES_FILE}: {len(entries)} captures")
+    say(f"wrote {CAPTURES_FILE}: {len(entries)} captures")
 
 
 def _choose(recipe: Recipe, checkouts: Path, work: Path) -> dict[str, Any]:
@@ -216,7 +217,7 @@ def _choose(recipe: Recipe, checkouts: Path, work: Path) -> dict[str, Any]:
     names = [path.name for path, _ in pairs]
     used = sorted({*np.ravel(triples).tolist(), *views, *between})
     baselines = [float(survey.baseline[a, b]) for a, b, _ in triples]
-    print(
+    say(
         f"{recipe.name}: {len(good)} of {len(pairs)} frames fit, epipolar {np.median(survey.error[used]):.2f} px, "
         f"baseline/depth {np.median(baselines):.2f}, path of {len(views)} views, "
         f"{np.median([survey.baseline[a, b] for a, b in pairwise(views)] or [0]):.2f} apart"
@@ -419,7 +420,7 @@ def as_json(captures: Sequence[dict[str, Any]]) -> str:
 
 def main() -> None:
     """Run the command."""
-    typer.run(choose_captures)
+    run(choose_captures)
 
 
 if __name__ == "__main__":
