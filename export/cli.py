@@ -202,7 +202,7 @@ def _export(
     from .report import print_details, print_summary
     from .stages import NamedTensors
     from .verify import Exported, verify
-    from .weights import hand_out, publish
+    from .weights import check_weights, hand_out, publish
     from .written import replace_folder, working_folder
 
     console = Console(stderr=True)
@@ -226,6 +226,10 @@ def _export(
         (print_details if verbose else print_summary)(errors)
         if not all(error.passed for error in errors):
             return False
+        if fused:
+            check_weights(graphs.whole, fused[0])
+        for stage, path in stages if staged else []:
+            check_weights(graphs.of_stage(stage), path)
         if out is not None:
             _say_written(publish(fused, out.parent), out, description)
         if staged is not None and new is not None:

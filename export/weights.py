@@ -61,6 +61,29 @@ def hand_out(graph: Path, out: Path) -> list[Path]:
     return [out, beside]
 
 
+def check_weights(graph: Path, written: Path) -> None:
+    """Raise InputError unless a graph that `hand_out` wrote holds the weights of the one that it was written from.
+
+    Outputs alone would not show a damaged weight that has little effect on the cases of the verification.
+    """
+    found, expected = (
+        {
+            tensor.name: _digest(tensor, path.parent)
+            for tensor in onnx.load(path, load_external_data=False).graph.initializer
+        }
+        for path in (written, graph)
+    )
+    wrong = sorted(name for name in expected if found.get(name) != expected[name])
+    if wrong or len(found) != len(expected):
+        raise InputError(f"{written.name}: its weights were not written as they are ({wrong[:1]}); is the disk sound?")
+
+
+def _digest(tensor: onnx.TensorProto, folder: Path) -> bytes:
+    outside = tensor.data_location == onnx.TensorProto.EXTERNAL
+    values = _values(tensor, folder) if outside else onnx.numpy_helper.to_array(tensor).tobytes()
+    return hashlib.sha256(values).digest()
+
+
 def publish(files: list[Path], folder: Path) -> list[Path]:
     """Move what `hand_out` wrote into a folder of the same file system, over a graph of the same name; their new paths.
 

@@ -9,6 +9,8 @@ within limits: this module run as a program prints what it found, as JSON.
 
 import importlib.util
 import json
+import math
+import signal
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -49,8 +51,12 @@ FISHEYE = {
 
 DEPTHS_USED = 500  # of one image, at least
 COUNT_BYTES, SMALLEST_RECORD = 8, 8
+# Of processor time, which other processes do not lengthen; a wall clock ends only what waits for ever.
 SECONDS, SECONDS_PER_MB = 20, 2
+WALL_FACTOR = 20
+OUT_OF_TIME = -getattr(signal, "SIGXCPU", 24)  # exit status of a process that the system ended for it
 MEMORY, MEMORY_PER_BYTE = 4 << 30, 40
+UNFINISHED = "COLMAP's library did not finish reading this model; is it damaged?"
 INSTALL = 'pip install "idesplat[colmap]"'
 
 
@@ -96,12 +102,15 @@ def _read_apart(model: Path) -> list[dict[str, Any]]:
     _check_counts(files)
     size = sum(file.stat().st_size for file in files)
     # -P: or else Python would look for modules in the current folder first
-    command = [sys.executable, "-P", "-m", __name__, str(model.absolute()), str(MEMORY + MEMORY_PER_BYTE * size)]
-    seconds = SECONDS + SECONDS_PER_MB * size / 1e6
+    seconds = math.ceil(SECONDS + SECONDS_PER_MB * size / 1e6)
+    limits = str(MEMORY + MEMORY_PER_BYTE * size), str(seconds)
+    command = [sys.executable, "-P", "-m", __name__, str(model.absolute()), *limits]
     try:
-        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=seconds)
+        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=WALL_FACTOR * seconds)
     except subprocess.TimeoutExpired:
-        raise InputError("COLMAP's library did not finish reading this model; is it damaged?") from None
+        raise InputError(UNFINISHED) from None
+    if done.returncode == OUT_OF_TIME:
+        raise InputError(UNFINISHED)
     if done.returncode != 0:
         reason = done.stderr.decode(errors="replace").strip().splitlines()[-1:] or [f"exit status {done.returncode}"]
         raise InputError(f"COLMAP's library cannot read this model ({reason[0]}); is it damaged?")
@@ -184,16 +193,17 @@ def observed_depths(reconstruction: "pycolmap.Reconstruction", image: "pycolmap.
     return points @ matrix[2, :3] + matrix[2, 3]
 
 
-def _limit_memory(limit: int) -> None:
+def _limit_resources(memory: int, seconds: int) -> None:
     try:
         import resource
     except ImportError:  # Windows has no such limit
         return
-    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
+    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
 
 
 if __name__ == "__main__":
-    _limit_memory(int(sys.argv[2]))
+    _limit_resources(int(sys.argv[2]), int(sys.argv[3]))
     try:
         import pycolmap
 

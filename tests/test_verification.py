@@ -357,6 +357,30 @@ def test_the_files_that_are_written_are_those_that_were_verified(
     assert "MISMATCH" in next(line for line in printed.splitlines() if form in line)
 
 
+@pytest.mark.parametrize("damaged", ("model.onnx", "encoder.onnx"))
+def test_a_weight_that_hardly_matters_is_compared_too(
+    damaged, small_checkpoint, without_tracing, tmp_path, monkeypatch, capsys
+):
+    """One weight is off by a rounding step, which no output shows."""
+    from idesplat.export import weights
+
+    hand_out = weights.hand_out
+
+    def hand_out_damaged(graph, out):
+        files = hand_out(graph, out)
+        if out.name == damaged:
+            model = onnx.load(out)
+            tensor = max(model.graph.initializer, key=lambda tensor: len(tensor.raw_data))
+            tensor.raw_data = bytes([tensor.raw_data[0] ^ 1]) + tensor.raw_data[1:]
+            onnx.save(model, out)
+        return files
+
+    monkeypatch.setattr(weights, "hand_out", hand_out_damaged)
+    assert run_command(cli.main, small_checkpoint, tmp_path / "model.onnx", "--staged", tmp_path / "staged") == 2
+    assert list(tmp_path.iterdir()) == []
+    assert f"{damaged}: its weights" in capsys.readouterr().err
+
+
 def test_the_whole_table_is_printed_on_request(small_checkpoint, without_tracing, tmp_path, capsys):
     assert run_command(cli.main, small_checkpoint, tmp_path / "model.onnx", "--verbose") == 0
     printed = capsys.readouterr().out
