@@ -36,7 +36,7 @@ ESTIMATED = "estimated"
 TRIPLES = 3
 BASELINE = 0.25  # of a triple, over the depth of what it sees
 SMALLEST_BASELINE = 0.08
-# Least overlap of what two of three frames see, and largest baseline: the first that give triples and a path of views.
+# Least overlap of what two of three frames see, and largest baseline: the first that give triples, or a path of views.
 LIMITS = ((0.6, 0.4), (0.5, 0.5), (0.35, 0.8))
 FEWEST_VIEWS = 6  # of a path, where the last limits leave so many
 WORST_EPIPOLAR = 1.0  # pixels, median over a frame's matches with a neighbour
@@ -212,12 +212,15 @@ def _choose(recipe: Recipe, checkouts: Path, work: Path) -> dict[str, Any]:
     survey = _kept_survey(work / recipe.name / "survey.npz", pairs)
     good = np.flatnonzero(survey.error < WORST_EPIPOLAR)
     places = np.stack([camera.extrinsics[:3, 3] for _, camera in pairs])
+    triples: list[tuple[int, int, int]] = []
+    views: list[int] = []
+    between: list[int] = []
     for limits in LIMITS:
         cost = _triple_costs(places, survey, good, *limits)
-        triples = _spread(cost, places, survey)
-        views, between = _longest_path(cost, places, survey)
-        if len(triples) == TRIPLES and len(views) >= FEWEST_VIEWS:
-            break
+        if len(triples) < TRIPLES:
+            triples = _spread(cost, places, survey)
+        if len(views) < FEWEST_VIEWS:
+            views, between = _longest_path(cost, places, survey)
     if len(triples) < TRIPLES:
         raise InputError(f"{recipe.name}: {len(triples)} triples found, expected {TRIPLES}; leave the capture out")
     names = [path.name for path, _ in pairs]
