@@ -37,14 +37,17 @@ from .checkouts import extract, fetch_checkout, list_folder
 ESTIMATED = "estimated"
 TRIPLES = 3
 BASELINE = 0.25  # of a triple, over the depth of what it sees
-SMALLEST_BASELINE, LARGEST_BASELINE = 0.08, 0.8
-LEAST_OVERLAP = 0.35  # of what two of three frames see
+SMALLEST_BASELINE = 0.08
+# Least overlap of what two of three frames see, and largest baseline: the first that give triples, or a path of views.
+LIMITS = ((0.6, 0.4), (0.5, 0.5), (0.35, 0.8))
+FEWEST_VIEWS = 6  # of a path, where the last limits leave so many
 WORST_EPIPOLAR = 1.0  # pixels, median over a frame's matches with a neighbour
 FEWEST_MATCHES = 30
 FARTHEST_ASIDE = 0.7  # how far a held-out frame stands from the line between its neighbours, in baselines
 EARLIEST, LATEST = 0.2, 0.8  # where it stands along that line
 SAME_PLACE = 0.4  # baselines: views of a path stand farther from each other
 PARTNERS = 3
+STARTS = 60
 DECIMALS = 9
 TINY = 1e-3
 
@@ -211,9 +214,17 @@ def _choose(recipe: Recipe, checkouts: Path, work: Path) -> dict[str, Any]:
     survey = _kept_survey(work / recipe.name / "survey.npz", pairs)
     good = np.flatnonzero(survey.error < WORST_EPIPOLAR)
     places = np.stack([camera.extrinsics[:3, 3] for _, camera in pairs])
-    cost = _triple_costs(places, survey, good)
-    triples = _spread(cost, places, survey)
-    views, between = _longest_path(cost, places, survey)
+    triples: list[tuple[int, int, int]] = []
+    views: list[int] = []
+    between: list[int] = []
+    for limits in LIMITS:
+        cost = _triple_costs(places, survey, good, *limits)
+        if len(triples) < TRIPLES:
+            triples = _spread(cost, places, survey)
+        if len(views) < FEWEST_VIEWS:
+            views, between = _longest_path(cost, places, survey)
+    if len(triples) < TRIPLES:
+        raise InputError(f"{recipe.name}: {len(triples)} triples found, expected {TRIPLES}; leave the capture out")
     names = [path.name for path, _ in pairs]
     used = sorted({*np.ravel(triples).tolist(), *views, *between})
     baselines = [float(survey.baseline[a, b]) for a, b, _ in triples]
@@ -310,14 +321,16 @@ def _epipolar(first: Sample, second: Sample) -> tuple[float, np.ndarray]:
     return error, depths_of_pair(a, b, first_camera.K, second_camera.K, between)[0]
 
 
-def _triple_costs(places: np.ndarray, survey: Survey, good: np.ndarray) -> np.ndarray:
+def _triple_costs(
+    places: np.ndarray, survey: Survey, good: np.ndarray, least_overlap: float, largest_baseline: float
+) -> np.ndarray:
     """How far each (first, second, target) is from a good triple, infinite if not allowed, [frames, frames, frames]."""
     count = len(places)
     cost = np.full((count, count, count), np.inf)
     for a in good:
         for b in good[good > a]:
             ratio = survey.baseline[a, b]
-            if not SMALLEST_BASELINE <= ratio <= LARGEST_BASELINE or survey.overlap[a, b] < LEAST_OVERLAP:
+            if not SMALLEST_BASELINE <= ratio <= largest_baseline or survey.overlap[a, b] < least_overlap:
                 continue
             way = places[b] - places[a]
             along = (places[good] - places[a]) @ way / (way @ way)
@@ -325,7 +338,7 @@ def _triple_costs(places: np.ndarray, survey: Survey, good: np.ndarray) -> np.nd
             overlap = np.minimum(survey.overlap[a, b], np.minimum(survey.overlap[a, good], survey.overlap[b, good]))
             off_middle = 2 * np.abs(along - 0.5) + aside
             found = np.abs(np.log2(ratio / BASELINE)) + off_middle - np.log2(np.maximum(overlap, TINY))
-            allowed = (along > EARLIEST) & (along < LATEST) & (aside < FARTHEST_ASIDE) & (overlap >= LEAST_OVERLAP)
+            allowed = (along > EARLIEST) & (along < LATEST) & (aside < FARTHEST_ASIDE) & (overlap >= least_overlap)
             cost[a, b, good] = cost[b, a, good] = np.where(allowed & (good != a) & (good != b), found, np.inf)
     return cost
 
@@ -338,7 +351,7 @@ def _spread(cost: np.ndarray, places: np.ndarray, survey: Survey) -> list[tuple[
         total = cost + penalty
         index = np.unravel_index(np.argmin(total), cost.shape)
         if not np.isfinite(total[index]):
-            raise InputError(f"{len(chosen)} triples found, expected {TRIPLES}; leave the capture out")
+            return chosen
         a, b, target = (int(i) for i in index)
         chosen.append((min(a, b), max(a, b), target))
         near = np.linalg.norm(places - places[target], axis=1) / survey.depth[target]
@@ -348,9 +361,12 @@ def _spread(cost: np.ndarray, places: np.ndarray, survey: Survey) -> list[tuple[
 
 
 def _longest_path(cost: np.ndarray, places: np.ndarray, survey: Survey) -> tuple[list[int], list[int]]:
-    """The path of most views, with a held-out frame between each two, that starts at one of the better triples."""
-    best = np.sort(np.unique(cost[np.isfinite(cost)]))[: 20 * TRIPLES]
-    paths = []
+    """The path of most views, with a held-out frame between each two, that starts at one of the better triples.
+
+    No views where there is no triple.
+    """
+    best = np.unique(cost[np.isfinite(cost)])[:STARTS]
+    paths: list[tuple[int, float, list[int], list[int]]] = [(0, 0.0, [], [])]
     for value in best:
         a, b, target = (int(i[0]) for i in np.nonzero(cost == value))
         views, between = [a, b], [target]
