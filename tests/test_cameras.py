@@ -288,7 +288,7 @@ def test_files_that_cannot_be_read(tmp_path):
         read_cameras(tmp_path / "nowhere.json")
     with pytest.raises(InputError, match="is a folder without"):
         read_cameras(tmp_path)
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="is a folder"):
         read_cameras(tmp_path, form=CameraFormat.OWN)
     with pytest.raises(InputError, match="cannot be read") as refused:  # without looking into it first
         read_cameras(tmp_path / "nowhere.json", form=CameraFormat.OWN)

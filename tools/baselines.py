@@ -17,10 +17,10 @@ from .cases import Posed
 # Planes that are tried: at first neighbours move no pixel by much more than one, then around the best ones closer.
 FEWEST_PLANES, MOST_PLANES = 64, 1024
 BEYOND = 2
-KEPT = 3
 CLOSER = 8
 # One of so many pixels a side judges all planes, then those around the best ones, then those around the best of these.
 STRIDES = (4, 2, 1)
+KEPT = (8, 4, 1)  # planes around which the next ones lie: few pixels do not tell similar ones apart
 TINY = 1e-9
 # Splats by rule: their standard deviation in pixels, and their opacity. Smaller ones hide less of their neighbours and
 # score higher at the photographs' own size, but leave gaps when seen four times as large, as in a viewer that fills a
@@ -50,7 +50,7 @@ def best_plane(
     pixels = float(max(_distances(context, extrinsics)) * K[0, 0] * (high - low))  # that the nearest plane moves
     candidates = np.linspace(low, high, min(max(ceil(pixels), FEWEST_PLANES), MOST_PLANES) + 1)
     step = candidates[1] - candidates[0]
-    for stride, kept in zip(STRIDES, (KEPT, 1, 1), strict=True):
+    for stride, kept in zip(STRIDES, KEPT, strict=True):
         judged = (slice(stride // 2, None, stride),) * 2
         if not valid[judged].any():
             continue
