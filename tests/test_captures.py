@@ -14,7 +14,6 @@ from conftest import run_command
 from idesplat.runtime import Runner, read_cameras, runner
 from idesplat.runtime.cameras import Camera
 from idesplat.runtime.errors import InputError
-from idesplat.runtime.images import load_image
 from idesplat.tools import captures, checkouts
 from idesplat.tools.captures import CaptureImages, parse_view_counts, read_captures
 from idesplat.tools.checkouts import extract, fetch_checkout, find_checkout, list_folder
@@ -187,7 +186,11 @@ def test_fitting_the_exposure_finds_gain_and_offset() -> None:
 
 @pytest.fixture
 def measured(
-    capture_file: Path, repository: tuple[Path, str], exported: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+    capture_file: Path,
+    repository: tuple[Path, str],
+    exported: tuple[Path, Path],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: Capsys,
 ) -> tuple[dict[str, Any], Runner]:
     """The command's results for triples and three views, with the runner that it used."""
     opened = Runner(exported[0])
@@ -206,10 +209,8 @@ def test_the_command_measures_what_the_library_gives(
     (capture,) = read_captures()
     images = CaptureImages(capture, scene / "images", (64, 96))
     case = images.case(["000.png", "002.png", "004.png"], ["001.png", "003.png"], opened.depth_range)
-    prediction = opened.predict(
-        [load_image(scene / "images" / name) for name in case.context.names],
-        [capture.cameras[name] for name in case.context.names],
-    )
+    context = case.context
+    prediction = opened.predict_arrays(context.images, context.extrinsics, context.intrinsics, case.near, case.far)
     truth = case.targets.picture(1)
     rendered = draw(prediction.need_gaussians(), case.targets, 1).rgb
     expected = -10 * np.log10(np.mean((rendered.clip(0, 1) - truth) ** 2))

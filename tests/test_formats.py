@@ -327,9 +327,9 @@ def test_the_command_leaves_out_what_is_faint(
     [
         (("none.ply", "b.spz"), "none.ply"),
         (("a.ply", "b.txt"), "b.txt: expected a file name"),
-        (("a.txt", "b.ply"), "a.txt: expected a file name"),
-        (("a.ply", "nowhere/b.spz"), "nowhere"),
-        (("a.ply", "a.ply"), "is the file to read"),
+        (("a.txt", "b.ply"), "a.txt: expected a splat file"),
+        (("a.ply", "a.ply/b.spz"), "a.ply is not a folder"),
+        (("a.ply", "a.ply"), "would replace the scene"),
         (("a.ply", "folder.spz"), "folder.spz"),
         (("folder.spz", "b.ply"), "folder.spz"),
     ],
