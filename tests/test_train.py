@@ -32,7 +32,7 @@ from idesplat.tools.baselines import SPLAT_PIXELS
 from idesplat.tools.curriculum import Objective, Phase, curriculum, phase_at, rate_at
 from idesplat.tools.initialisation import new_model
 from idesplat.tools.train import CHECKPOINT, CURVES, LOG, PICTURES, Run, Settings
-from idesplat.tools.training_data import Order, drawn_ahead, training_order
+from idesplat.tools.training_data import Order, draw_views, drawn_ahead, training_order
 from idesplat.tools.training_folders import FolderScenes
 from idesplat.tools.training_log import TrainingLog
 from idesplat.tools.training_state import TrainingState
@@ -178,10 +178,10 @@ def test_scenes_come_in_order_and_repeat() -> None:
     orders = [training_order(5, step, 0, True, 32, 32, many=True) for step in range(120)]
     assert orders == [training_order(5, step, 0, True, 32, 32, many=True) for step in range(120)]
     assert len({order.seed for order in orders}) == 120 and {order.context for order in orders} == {2, 3}
-    drawn = list(drawn_ahead(iter(orders[:7])))
+    drawn = list(drawn_ahead(iter(orders[:7]), draw_views))
     for order, views in zip(orders, drawn, strict=False):
         assert views.images.shape == (order.context, 3, 32, 32)
-        again = next(drawn_ahead(iter([order])))
+        again = next(drawn_ahead(iter([order]), draw_views))
         assert torch.equal(views.images, again.images) and torch.equal(views.inverse_depth, again.inverse_depth)
 
 
@@ -189,7 +189,7 @@ def test_scenes_come_in_order_and_repeat() -> None:
 def test_a_few_steps_on_one_scene_learn(objective: Objective) -> None:
     """Depth and novel views each get better where they are asked for."""
     state = TrainingState(SMALL, seed=0, lr=3e-3, vit_lr=3e-3)
-    views = next(drawn_ahead(iter([Order(11, 2, (1,), 64, 64)])))
+    views = next(drawn_ahead(iter([Order(11, 2, (1,), 64, 64)]), draw_views))
     phase = curriculum(objective, gradual=False)[0]
     entries = []
     for _ in range(14):

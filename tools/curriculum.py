@@ -17,6 +17,13 @@ class Objective(StrEnum):
     BOTH = "both"
 
 
+class Part(StrEnum):
+    """Which part of the network is trained."""
+
+    ALL = "all"
+    HEAD = "head"
+
+
 @dataclass(frozen=True)
 class Phase:
     """A part of the run, which ends at the share `until` of all steps."""

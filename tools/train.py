@@ -16,15 +16,17 @@ import typer
 
 from ..runtime.errors import InputError, exit_on_input_error
 from ..runtime.files import make_folder
-from .curriculum import Objective, Phase, curriculum, phase_at, rate_at
+from .curriculum import Objective, Part, Phase, curriculum, phase_at, rate_at
 
 if TYPE_CHECKING:  # torch and compiled code are loaded only once there is something to train
     from ..model.config import IDESplatConfig
-    from .losses import Perceptual
+    from ..model.idesplat import IDESplat
     from .training_data import Order, Views
+    from .training_tasks import TrainingTask
 
 CHECKPOINT, LOG, CURVES, PICTURES = "last.ckpt", "log.jsonl", "curves.png", "predictions.png"
-CURVES_SHOWN = ("loss", "abs_rel", "validation_abs_rel", "validation_psnr", "gradient")
+FEATURES = "features"
+CURVES_SHOWN = ("loss", "psnr", "input_psnr", "abs_rel", "validation_abs_rel", "validation_psnr", "gradient")
 SHOWN = {"loss": "loss", "AbsRel": "abs_rel", "PSNR": "psnr"}
 # glibc's mallopt parameters: without them every large tensor's memory goes back to the system and is cleared again.
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
@@ -48,6 +50,9 @@ class Settings:
     seed: int
     init: str
     data: list[str]
+    part: str = "all"
+    scenes: int = 0
+    real_ratio: float = 1.0
 
 
 @exit_on_input_error
@@ -57,6 +62,18 @@ def train(
     init: Annotated[Path | None, typer.Option(help="Checkpoint to start from, released or own.")] = None,
     data: Annotated[
         list[Path] | None, typer.Option(help="Folder with photographs and transforms.json, instead of drawn scenes.")
+    ] = None,
+    real_ratio: Annotated[
+        float, typer.Option(help="Share of the scenes taken from --data; the others are synthetic.", min=0, max=1)
+    ] = 1.0,
+    part: Annotated[
+        Part, typer.Option("--train", help="The whole network, or the Gaussian head of --init with depth frozen.")
+    ] = Part.ALL,
+    scenes: Annotated[
+        int, typer.Option(help="With --train head: different scenes. Each takes some 6 MB of disk at 256x256.", min=1)
+    ] = 1000,
+    features: Annotated[
+        Path | None, typer.Option(help="With --train head: folder of cached features, instead of one inside of --out.")
     ] = None,
     objective: Annotated[Objective, typer.Option(help="True depth, rendered novel views, or both.")] = Objective.BOTH,
     gradual: Annotated[
@@ -74,37 +91,60 @@ def train(
 ) -> None:
     """Train IDESplat on procedural scenes with exact depth and cameras, or on photographs."""
     start, folders = str(init.resolve()) if init else "", [str(folder.resolve()) for folder in data or []]
-    settings = Settings(preset, objective.value, gradual, steps, batch, size, lr, vit_lr, seed, start, folders)
+    head = part is Part.HEAD
+    settings = Settings(
+        preset,
+        objective.value,
+        gradual and not head,
+        steps,
+        batch,
+        size,
+        lr,
+        vit_lr,
+        seed,
+        start,
+        folders,
+        part.value,
+        scenes if head else 0,
+        real_ratio,
+    )
     config = _config(settings)
     _keep_memory()
     import torch
 
     torch.set_num_threads(threads)
     torch.set_flush_denormal(True)
-    Run(make_folder(out), settings, config).go(save_every * 60, validate_every)
+    Run(make_folder(out), settings, config, features).go(save_every * 60, validate_every)
 
 
 class Run:
     """One training run in its folder."""
 
-    def __init__(self, folder: Path, settings: Settings, config: "IDESplatConfig") -> None:
-        """Start it, or go on from the checkpoint in the folder; raises InputError if that is another run's."""
-        from .losses import load_perceptual
+    def __init__(
+        self, folder: Path, settings: Settings, config: "IDESplatConfig", features: Path | None = None
+    ) -> None:
+        """Start it, or go on from the checkpoint in the folder; raises InputError if that is another run's.
+
+        features: the folder of cached features, if not one inside of `folder`.
+        """
         from .training_log import TrainingLog
         from .training_state import TrainingState
 
         self.folder, self.settings = folder, settings
-        self.objective = Objective(settings.objective)
-        self.phases = curriculum(self.objective, settings.gradual)
-        self.state: TrainingState = TrainingState(config, settings.seed, settings.lr, settings.vit_lr)
-        if (folder / CHECKPOINT).exists():
+        trained = _trained(settings)
+        self.state: TrainingState = TrainingState(config, settings.seed, settings.lr, settings.vit_lr, trained)
+        resumed = (folder / CHECKPOINT).exists()
+        if resumed:
             self.state.resume(folder / CHECKPOINT, asdict(settings))
         elif settings.init:
             self.state.start_from(Path(settings.init))
-        self.draw: Callable[[Order], Views] = _source(settings, config)
+        self.source: Callable[[Order], Views] = _source(settings, config)
+        self.task: TrainingTask[Any] = _task(settings, self.state.model, self.source, features or folder / FEATURES)
+        self.phases = self.task.phases
+        if not resumed:
+            self.task.prepare(self.state.model)
+            self.state.reset_mean()
         self.log: TrainingLog = TrainingLog(folder / LOG, self.state.step)
-        renders = any(phase.gaussians for phase in self.phases)
-        self.perceptual: Perceptual | None = load_perceptual() if renders else None
 
     def go(self, save_every: float, validate_every: int) -> None:
         """Train to the last step. save_every: seconds; validate_every: steps."""
@@ -113,7 +153,7 @@ class Run:
         saved = time.monotonic()
         bar = Bar(self.settings.steps, self.state.step)
         with bar.progress:
-            scenes = drawn_ahead(self.orders(), self.draw)
+            scenes = drawn_ahead(self.orders(), self.task.load)
             while self.state.step < self.settings.steps:
                 entry = self.one_step(scenes)
                 if self.state.step % validate_every == 0 or self.state.step == self.settings.steps:
@@ -135,24 +175,19 @@ class Run:
 
     def orders(self) -> "Iterator[Order]":
         """The scenes of every step from here on."""
-        from .training_data import training_order
-
         for step in range(self.state.step, self.settings.steps):
-            phase = self.phase(step)
-            side = self.settings.size // phase.shrink
             for slot in range(self.settings.batch):
-                yield training_order(self.settings.seed, step, slot, phase.gaussians, side, side, phase.units > 1)
+                yield self.task.order(step, slot, self.phase(step))
 
-    def one_step(self, scenes: "Iterator[Views]") -> dict[str, Any]:
+    def one_step(self, scenes: Iterator[Any]) -> dict[str, Any]:
         """Gather the gradients of a batch and step along them; returns what is logged."""
         from .training_log import finite
-        from .training_step import scene_loss
 
         started = time.monotonic()
         phase, batch = self.phase(self.state.step), self.settings.batch
         entries = []
         for _ in range(batch):
-            loss, entry = scene_loss(self.state.model, next(scenes), phase, self.objective, self.perceptual)
+            loss, entry = self.task.loss(self.state.model, next(scenes), self.state.step, phase)
             (loss / batch).backward()
             entries.append(entry)
         norm = self.state.update(rate_at(self.phases, self.state.step, self.settings.steps))
@@ -167,7 +202,7 @@ class Run:
 
         phase = self.phase(self.state.step - 1)
         side = self.settings.size // phase.shrink
-        found = validate(self.state.mean_model(), phase, side, self.draw, self.folder / PICTURES)
+        found = validate(self.state.mean_model(), phase, side, self.source, self.folder / PICTURES)
         self.log.draw_curves(self.folder / CURVES, CURVES_SHOWN)
         return {name: finite(value) for name, value in found.items()}
 
@@ -202,8 +237,13 @@ def _config(settings: Settings) -> "IDESplatConfig":
     presets = {name: config for name, config in PRESETS.items() if isinstance(config, IDESplatConfig)}
     if settings.preset not in presets:
         raise InputError(f"--preset {settings.preset}: no such preset; choose one of {', '.join(presets)}")
-    if settings.data and settings.objective != Objective.PHOTOMETRIC:
-        raise InputError(f"--objective {settings.objective}: photographs have no true depth; use photometric")
+    if settings.part == Part.HEAD and not settings.init:
+        raise InputError("--train head: there is no head to train yet; give a checkpoint with --init")
+    only_captures = settings.data and settings.real_ratio == 1
+    if only_captures and settings.part != Part.HEAD and settings.objective != Objective.PHOTOMETRIC:
+        raise InputError(
+            f"--objective {settings.objective}: photographs have no true depth; use photometric, or --real-ratio"
+        )
     config = presets[settings.preset]
     phases = curriculum(Objective(settings.objective), settings.gradual)
     multiple = max(phase.shrink for phase in phases) * max(config.size_multiple, LEAST_SIDE)
@@ -213,14 +253,42 @@ def _config(settings: Settings) -> "IDESplatConfig":
 
 
 def _source(settings: Settings, config: "IDESplatConfig") -> "Callable[[Order], Views]":
-    """What draws the scenes: the given folders, or else the procedural ones."""
-    if not settings.data:
-        from .training_data import draw_views
+    """What makes the scenes' views: synthetic scenes, the given folders, or both."""
+    from .training_data import draw_views
 
+    if not settings.data:
         return draw_views
     from .training_folders import FolderScenes
 
-    return FolderScenes([Path(folder) for folder in settings.data], config.near, config.far).draw
+    captures = FolderScenes([Path(folder) for folder in settings.data], config.near, config.far)
+    if settings.real_ratio == 1:
+        return captures.draw
+    return lambda order: captures.draw(order) if order.real else draw_views(order)
+
+
+def _trained(settings: Settings) -> tuple[str, ...]:
+    """The beginnings of the trained parameters' names."""
+    from .training_tasks import HeadTask, WholeTask
+
+    return HeadTask.trained if settings.part == Part.HEAD else WholeTask.trained
+
+
+def _task(
+    settings: Settings, model: "IDESplat", source: "Callable[[Order], Views]", features: Path
+) -> "TrainingTask[Any]":
+    """What the settings ask for; features: the folder of cached features."""
+    from .head_training import FeatureCache
+    from .losses import load_perceptual
+    from .training_tasks import HeadTask, WholeTask
+
+    size, batch = settings.size, settings.batch
+    if settings.part == Part.HEAD:
+        cache = FeatureCache(features, model, source, repr((size, settings.data)))
+        return HeadTask(cache, settings.seed, size, batch, settings.scenes, settings.real_ratio, load_perceptual())
+    objective = Objective(settings.objective)
+    phases = curriculum(objective, settings.gradual)
+    perceptual = load_perceptual() if any(phase.gaussians for phase in phases) else None
+    return WholeTask(phases, objective, settings.seed, size, source, settings.real_ratio, perceptual)
 
 
 def _keep_memory() -> None:

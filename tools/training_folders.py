@@ -19,7 +19,9 @@ from .training_data import Order, Views
 CAMERAS = "transforms.json"
 # The other context views are drawn from this many cameras nearest to the first one, the targets from as many nearest
 # to the middle of the context.
-NEIGHBOURHOOD = 8
+NEIGHBOURHOOD = 4
+# A camera that looks this much elsewhere counts as standing twice as far away.
+TURN_DEG = 30.0
 
 
 Pairs = list[tuple[Path, Camera]]
@@ -88,14 +90,16 @@ def _pairs(folder: Path) -> Pairs:
 
 def _choose(rng: np.random.Generator, pairs: Pairs, context: int, targets: int) -> list[int]:
     """Indices of context and target views."""
-    places = np.stack([camera.extrinsics[:3, 3] for _, camera in pairs])  # [cameras, 3]
+    poses = np.stack([camera.extrinsics for _, camera in pairs])  # [cameras, 4, 4]
+    places, forward = poses[:, :3, 3], poses[:, :3, 2]
     if len(places) < context + targets:
         found = f"{len(places)} photographs, expected at least {context + targets}"
         raise InputError(f"{pairs[0][0].parent}: {found} to train on; add photographs or leave the folder out")
     chosen = [int(rng.integers(len(places)))]
     for count in (context - 1, targets):
         rest = np.setdiff1d(np.arange(len(places)), chosen)
-        distances = np.linalg.norm(places[rest] - places[chosen].mean(axis=0), axis=1)
+        turns = np.degrees(np.arccos(np.clip((forward[rest] @ forward[chosen].T).min(axis=1), -1, 1)))
+        distances = np.linalg.norm(places[rest] - places[chosen].mean(axis=0), axis=1) * (1 + (turns / TURN_DEG) ** 2)
         nearest = rest[np.argsort(distances)][: max(NEIGHBOURHOOD, count)]
         chosen += [int(index) for index in rng.choice(nearest, count, replace=False)]
     return chosen

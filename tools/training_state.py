@@ -28,16 +28,24 @@ BACKBONE_PREFIX = "encoder.vit."
 class TrainingState:
     """The network in training. `step` counts the steps done."""
 
-    def __init__(self, config: IDESplatConfig, seed: int, lr: float, vit_lr: float) -> None:
-        """A new network drawn from `seed`; learning rates at their highest, the ViT's and that of the rest."""
+    def __init__(
+        self, config: IDESplatConfig, seed: int, lr: float, vit_lr: float, trained: tuple[str, ...] = ("",)
+    ) -> None:
+        """A new network drawn from `seed`; learning rates at their highest, the ViT's and that of the rest.
+
+        trained: the beginnings of the names of the parameters that are trained; all others are frozen.
+        """
         self.model = with_compiled_products(new_model(config, seed))
         self.mean = {name: value.clone() for name, value in self.model.state_dict().items()}
         self.step = 0
-        parameters = list(self.model.named_parameters())
+        for name, parameter in self.model.named_parameters():
+            parameter.requires_grad_(name.startswith(trained))
+        parameters = [(name, p) for name, p in self.model.named_parameters() if p.requires_grad]
         groups = [
             {"params": [p for name, p in parameters if not name.startswith(BACKBONE_PREFIX)], "highest": lr},
             {"params": [p for name, p in parameters if name.startswith(BACKBONE_PREFIX)], "highest": vit_lr},
         ]
+        groups = [group for group in groups if group["params"]]
         self.optimizer = torch.optim.AdamW(groups, lr=lr, weight_decay=WEIGHT_DECAY, fused=True)
 
     def start_from(self, path: Path) -> None:
@@ -46,6 +54,10 @@ class TrainingState:
             fill(self.model, read_state_dict(path), path)
         except CheckpointError as error:
             raise InputError(str(error)) from None
+        self.reset_mean()
+
+    def reset_mean(self) -> None:
+        """Start the running mean anew, with the weights as they are."""
         self.mean = {name: value.clone() for name, value in self.model.state_dict().items()}
 
     def update(self, rate: float) -> float:
