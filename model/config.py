@@ -160,6 +160,8 @@ class IDESplatConfig(EncoderConfig):
     ffn_ratio: int = 2
     ffn_kernel: int = 5
     focus: FocusConfig = FocusConfig()
+    # Hidden channels of the Gaussian head's second input, what other views show at a pixel's place; 0: it has none.
+    cross_view_channels: int = 0
 
     @property
     def unets(self) -> Iterator[tuple[int, UNetConfig]]:
@@ -228,6 +230,7 @@ PRESETS: dict[str, IDESplatConfig | DepthSplatConfig] = {
         ),
         residual_unet=UNetConfig(channels=8, levels=5),
         focus=FocusConfig(channels=48, window=8, topk=(64, 64, 32, 32)),
+        cross_view_channels=16,
         # Procedural surfaces hardly shine: bands above the first would learn little, and double the .ply file.
         sh_degree=1,
         scale_in_pixels=True,

@@ -7,6 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .config import IDESplatConfig
+from .cross_view import CHANNELS, cross_view_features
 from .dpbu import Boosted
 from .encoder import Encoded, normalise
 from .gaussian_adapter import BASE_PARAMETERS, GaussianAdapter, WorldGaussians
@@ -39,6 +40,23 @@ class HeadInputs(NamedTuple):
     features_cnn: Tensor  # [views, feature channels, h, w]
     context: Tensor  # [views, channels, h, w] of the first DPBU
     features_last: Tensor  # [views, channels, 4h, 4w] of the third DPBU
+    neighbours: Tensor  # [views, n]
+
+
+class CrossViewHead(nn.Module):
+    """What other views show at a pixel's place, to a change of its raw parameters; at first there is none."""
+
+    def __init__(self, channels: int, parameters: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(CHANNELS, channels, 3, padding=1)
+        self.conv2 = nn.Conv2d(channels, parameters, 3, padding=1)
+        nn.init.zeros_(self.conv2.weight)
+        nn.init.zeros_(self.conv2.bias)  # type: ignore[arg-type]
+
+    def forward(self, images: Tensor, cameras: Cameras, inputs: HeadInputs) -> Tensor:
+        """Images [views, 3, H, W] in [0, 1] -> [views, parameters, H, W]."""
+        compared = cross_view_features(images, inputs.inverse_depth, cameras, inputs.neighbours)
+        return self.conv2(F.gelu(self.conv1(compared)))
 
 
 class GaussianStage(nn.Module):
@@ -58,6 +76,7 @@ class GaussianStage(nn.Module):
         parameters = BASE_PARAMETERS + 3 * config.sh_coefficients
         self.head1 = nn.Conv2d(channels, parameters, 3, padding=1, padding_mode="replicate")
         self.head2 = nn.Conv2d(parameters, parameters, 3, padding=1, padding_mode="replicate")
+        self.cross_view = CrossViewHead(config.cross_view_channels, parameters) if config.cross_view_channels else None
         self.adapter = GaussianAdapter(config)
 
     def forward(
@@ -71,12 +90,14 @@ class GaussianStage(nn.Module):
     ) -> HeadInputs:
         """Everything up to the final inverse depth; none of it changes while the Gaussian head alone is trained."""
         inverse_depth = self.fused_inverse_depth(units, cameras, *images.shape[2:])
-        return HeadInputs(inverse_depth, encoded.features_cnn, units[0].context, units[2].features)
+        return HeadInputs(inverse_depth, encoded.features_cnn, units[0].context, units[2].features, encoded.neighbours)
 
     def predict(self, images: Tensor, cameras: Cameras, inputs: HeadInputs) -> Predicted:
         """Focused module, Gaussian head and adapter."""
         features = self.pixel_features(normalise(images), inputs)
         raw = self.head2(F.gelu(self.head1(features)))
+        if self.cross_view is not None:
+            raw = raw + self.cross_view(images, cameras, inputs)
         depth = 1 / inputs.inverse_depth[:, 0]
         return Predicted(depth, self.adapter(raw, depth, images, cameras), features, raw)
 

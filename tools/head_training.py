@@ -22,7 +22,7 @@ from .training_data import CLOSEST, Order, Views
 from .training_step import PHOTOMETRIC_SHARE, psnr_of, render_targets
 
 # The parts of the network that are trained: the focused module with what leads into it, and the head.
-HEAD_PARTS = ("conv_image", "fuse", "focus", "expand", "head1", "head2")
+HEAD_PARTS = ("conv_image", "fuse", "focus", "expand", "head1", "head2", "cross_view")
 HEAD_PREFIXES = tuple(f"gaussians.{part}." for part in HEAD_PARTS)
 # Context views of the scenes, and the share of the scenes that have so many.
 VIEW_SHARES = {2: 0.75, 3: 0.15, 4: 0.1}
@@ -30,6 +30,8 @@ VIEW_SHARES = {2: 0.75, 3: 0.15, 4: 0.1}
 # raised by this factor, which half transparent Gaussians need to leave no gaps.
 SATURATED_OPACITY, START_OPACITY = 0.95, 0.5
 SCALE_GAIN = 1.1
+# Head inputs that are stored in half precision, by the beginnings of their names.
+HALVED = ("features", "context")
 # Scenes from which the means before are taken.
 RESET_SCENES = 4
 
@@ -161,12 +163,15 @@ def _packed(sample: HeadSample) -> dict[str, Tensor]:
         views[name] = (views[name] * 255).round().to(torch.uint8)
     del views["inverse_depth"]  # the truth, which the head's losses do not use
     inputs = sample.inputs._asdict()
-    halves = {name: value.half() for name, value in inputs.items() if name != "inverse_depth"}
-    return {**views, **halves, "inverse_depth": inputs["inverse_depth"]}
+    return {**views, **{name: value.half() if name.startswith(HALVED) else value for name, value in inputs.items()}}
+
+
+def _unhalved(value: Tensor) -> Tensor:
+    return value.float() if value.dtype == torch.float16 else value
 
 
 def _unpacked(packed: dict[str, Tensor]) -> HeadSample:
-    inputs = HeadInputs(**{name: packed.pop(name).float() for name in HeadInputs._fields})
+    inputs = HeadInputs(**{name: _unhalved(packed.pop(name)) for name in HeadInputs._fields})
     for name in ("images", "target_images"):
         packed[name] = packed[name].float() / 255
     return HeadSample(Views(**packed, inverse_depth=None), inputs)

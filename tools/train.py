@@ -277,13 +277,14 @@ def _task(
     settings: Settings, model: "IDESplat", source: "Callable[[Order], Views]", features: Path
 ) -> "TrainingTask[Any]":
     """What the settings ask for; features: the folder of cached features."""
+    from ..model.gaussian_head import HeadInputs
     from .head_training import FeatureCache
     from .losses import load_perceptual
     from .training_tasks import HeadTask, WholeTask
 
     size, batch = settings.size, settings.batch
     if settings.part == Part.HEAD:
-        cache = FeatureCache(features, model, source, repr((size, settings.data)))
+        cache = FeatureCache(features, model, source, repr((size, settings.data, HeadInputs._fields)))
         return HeadTask(cache, settings.seed, size, batch, settings.scenes, settings.real_ratio, load_perceptual())
     objective = Objective(settings.objective)
     phases = curriculum(objective, settings.gradual)

@@ -23,6 +23,8 @@ WEIGHT_DECAY = 0.01
 LARGEST_GRADIENT = 1.0
 # The optimiser's groups, in this order.
 BACKBONE_PREFIX = "encoder.vit."
+# A part that older checkpoints lack. As it is made, it changes nothing.
+OPTIONAL_PREFIX = "gaussians.cross_view."
 
 
 class TrainingState:
@@ -51,7 +53,9 @@ class TrainingState:
     def start_from(self, path: Path) -> None:
         """Take the weights of a checkpoint, released or own; raises InputError if it does not fit the network."""
         try:
-            fill(self.model, read_state_dict(path), path)
+            tensors = read_state_dict(path)
+            made = self.model.state_dict()
+            fill(self.model, {name: made[name] for name in made if name.startswith(OPTIONAL_PREFIX)} | tensors, path)
         except CheckpointError as error:
             raise InputError(str(error)) from None
         self.reset_mean()
