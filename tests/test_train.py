@@ -171,7 +171,7 @@ def test_curriculum_and_rates() -> None:
     assert rates[0] > 0 and rates[-1] == pytest.approx(0.01, abs=1e-3)
     # Half the work is done: 0.57 + 0.14 + 0.30 + 1.43 + 1.95 = 4.39 in all, 1.01 of it before the last but one phase.
     half = next(step for step, rate in enumerate(rates) if step > peak and rate < 0.505)
-    assert half == pytest.approx(1000 * (0.74 + (0.02 + (4.39 - 0.02) / 2 - 1.01) / 11), abs=1.5)
+    assert half == pytest.approx(1000 * (0.74 + (0.05 + (4.39 - 0.05) / 2 - 1.01) / 11), abs=1.5)
 
 
 def test_scenes_come_in_order_and_repeat() -> None:

@@ -23,6 +23,8 @@ WEIGHT_DECAY = 0.01
 LARGEST_GRADIENT = 1.0
 # The optimiser's groups, in this order.
 BACKBONE_PREFIX = "encoder.vit."
+# Weights that were trained on photographs elsewhere, and stay as they are.
+FROZEN_PREFIX = "encoder.photo.network."
 # A part that older checkpoints lack. As it is made, it changes nothing.
 OPTIONAL_PREFIX = "gaussians.cross_view."
 
@@ -41,7 +43,7 @@ class TrainingState:
         self.mean = {name: value.clone() for name, value in self.model.state_dict().items()}
         self.step = 0
         for name, parameter in self.model.named_parameters():
-            parameter.requires_grad_(name.startswith(trained))
+            parameter.requires_grad_(name.startswith(trained) and not name.startswith(FROZEN_PREFIX))
         parameters = [(name, p) for name, p in self.model.named_parameters() if p.requires_grad]
         groups = [
             {"params": [p for name, p in parameters if not name.startswith(BACKBONE_PREFIX)], "highest": lr},
