@@ -1,4 +1,4 @@
-"""What neighbouring views show at a pixel's place: a scene whose answer is known by hand, and the head that reads it."""
+"""What neighbouring views show at a pixel's place: scenes whose answer is known by hand."""
 
 import pytest
 import torch

@@ -26,6 +26,13 @@ class Part(StrEnum):
     HEAD = "head"
 
 
+class Precision(StrEnum):
+    """Number format of convolutions and attention in training."""
+
+    FLOAT32 = "float32"
+    BF16 = "bf16"
+
+
 @dataclass(frozen=True)
 class Phase:
     """A part of the run, which ends at the share `until` of all steps."""

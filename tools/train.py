@@ -5,6 +5,7 @@ had not been.
 """
 
 import ctypes
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -16,12 +17,14 @@ import typer
 
 from ..runtime.errors import InputError, exit_on_input_error
 from ..runtime.files import make_folder
-from .curriculum import Objective, Part, Phase, curriculum, phase_at, rate_at
+from .curriculum import Objective, Part, Phase, Precision, curriculum, phase_at, rate_at
 
 if TYPE_CHECKING:  # torch and compiled code are loaded only once there is something to train
     from ..model.config import IDESplatConfig
     from ..model.idesplat import IDESplat
+    from .parallel import Team
     from .training_data import Order, Views
+    from .training_log import TrainingLog
     from .training_tasks import TrainingTask
 
 CHECKPOINT, LOG, CURVES, PICTURES = "last.ckpt", "log.jsonl", "curves.png", "predictions.png"
@@ -53,6 +56,7 @@ class Settings:
     part: str = "all"
     scenes: int = 0
     real_ratio: float = 1.0
+    precision: str = "float32"
 
 
 @exit_on_input_error
@@ -85,7 +89,13 @@ def train(
     lr: Annotated[float, typer.Option(help="Highest learning rate.", min=0)] = 1e-3,
     vit_lr: Annotated[float, typer.Option(help="Highest learning rate of the ViT.", min=0)] = 5e-4,
     seed: Annotated[int, typer.Option(help="Of the weights and the scenes.", min=0)] = 0,
-    threads: Annotated[int, typer.Option(help="torch's threads; drawing scenes takes a share of another.", min=1)] = 1,
+    precision: Annotated[
+        Precision, typer.Option(help="Of convolutions and attention; bfloat16 is quicker where the CPU has it.")
+    ] = Precision.FLOAT32,
+    processes: Annotated[int, typer.Option(help="Processes that share the scenes of a step.", min=1)] = 1,
+    threads: Annotated[
+        int, typer.Option(help="torch's threads in each process; drawing scenes takes a share of another.", min=1)
+    ] = 1,
     save_every: Annotated[float, typer.Option(help="Minutes between checkpoints.", min=0)] = 3.0,
     validate_every: Annotated[int, typer.Option(help="Steps between validations.", min=1)] = 200,
 ) -> None:
@@ -107,30 +117,55 @@ def train(
         part.value,
         scenes if head else 0,
         real_ratio,
+        precision.value,
     )
     config = _config(settings)
-    _keep_memory()
-    import torch
+    if processes > batch:
+        raise InputError(f"--processes {processes}: more than the {batch} scenes of a step; raise --batch")
+    from .parallel import Team, other_processes
 
-    torch.set_num_threads(threads)
-    torch.set_flush_denormal(True)
-    Run(make_folder(out), settings, config, features).go(save_every * 60, validate_every)
+    folder = make_folder(out)
+    run = Run(folder, settings, config, features, Team(0, processes), threads)
+    with other_processes(processes, _work, folder, settings, config, features, threads, validate_every):
+        run.go(save_every * 60, validate_every)
+
+
+def _work(
+    team: "Team",
+    folder: Path,
+    settings: Settings,
+    config: "IDESplatConfig",
+    features: Path | None,
+    threads: int,
+    validate_every: int,
+) -> None:
+    """What a process of a team does that does not lead it."""
+    Run(folder, settings, config, features, team, threads).go(math.inf, validate_every)
 
 
 class Run:
     """One training run in its folder."""
 
     def __init__(
-        self, folder: Path, settings: Settings, config: "IDESplatConfig", features: Path | None = None
+        self,
+        folder: Path,
+        settings: Settings,
+        config: "IDESplatConfig",
+        features: Path | None = None,
+        team: "Team | None" = None,
+        threads: int = 1,
     ) -> None:
         """Start it, or go on from the checkpoint in the folder; raises InputError if that is another run's.
 
-        features: the folder of cached features, if not one inside of `folder`.
+        features: the folder of cached features, if not one inside of `folder`. team: of which this process is one.
+        threads: torch's, in this process.
         """
+        from .parallel import Team
         from .training_log import TrainingLog
         from .training_state import TrainingState
 
-        self.folder, self.settings = folder, settings
+        _prepare_process(threads)
+        self.folder, self.settings, self.team = folder, settings, team or Team()
         trained = _trained(settings)
         self.state: TrainingState = TrainingState(config, settings.seed, settings.lr, settings.vit_lr, trained)
         resumed = (folder / CHECKPOINT).exists()
@@ -144,58 +179,67 @@ class Run:
         if not resumed:
             self.task.prepare(self.state.model)
             self.state.reset_mean()
-        self.log: TrainingLog = TrainingLog(folder / LOG, self.state.step)
+        if settings.precision == Precision.BF16:
+            from .mixed_precision import with_bfloat16
+
+            with_bfloat16(self.state.model)
+        self.log: TrainingLog | None = TrainingLog(folder / LOG, self.state.step) if self.team.leads else None
 
     def go(self, save_every: float, validate_every: int) -> None:
         """Train to the last step. save_every: seconds; validate_every: steps."""
         from .training_data import drawn_ahead
 
         saved = time.monotonic()
-        bar = Bar(self.settings.steps, self.state.step)
+        bar = Bar(self.settings.steps, self.state.step, shown=self.team.leads)
         with bar.progress:
             scenes = drawn_ahead(self.orders(), self.task.load)
             while self.state.step < self.settings.steps:
                 entry = self.one_step(scenes)
+                if self.log is None:
+                    continue
                 if self.state.step % validate_every == 0 or self.state.step == self.settings.steps:
-                    entry |= self.validate()
+                    entry |= self.validate(self.log)
                 self.log.add(entry)
                 bar.show(entry)
                 if time.monotonic() - saved >= save_every:
                     self.save()
                     saved = time.monotonic()
             scenes.close()
-        self.save()
-        folder = self.folder
-        print(f"{folder / CHECKPOINT}: the trained network, for idesplat-export; {folder / LOG}: every step")
-        print(f"{folder / CURVES} and {folder / PICTURES}: curves, and photograph, truth, prediction and error")
+        if self.team.leads:
+            self.save()
+            folder = self.folder
+            print(f"{folder / CHECKPOINT}: the trained network, for idesplat-export; {folder / LOG}: every step")
+            print(f"{folder / CURVES} and {folder / PICTURES}: curves, and photograph, truth, prediction and error")
 
     def phase(self, step: int) -> Phase:
         """The phase of a step, counted from 0."""
         return phase_at(self.phases, step, self.settings.steps)
 
     def orders(self) -> "Iterator[Order]":
-        """The scenes of every step from here on."""
+        """This process's scenes of every step from here on."""
         for step in range(self.state.step, self.settings.steps):
-            for slot in range(self.settings.batch):
+            for slot in self.team.share(self.settings.batch):
                 yield self.task.order(step, slot, self.phase(step))
 
     def one_step(self, scenes: Iterator[Any]) -> dict[str, Any]:
         """Gather the gradients of a batch and step along them; returns what is logged."""
+        from .parallel import mean_entries
         from .training_log import finite
 
         started = time.monotonic()
         phase, batch = self.phase(self.state.step), self.settings.batch
         entries = []
-        for _ in range(batch):
+        for _ in self.team.share(batch):
             loss, entry = self.task.loss(self.state.model, next(scenes), self.state.step, phase)
             (loss / batch).backward()
             entries.append(entry)
+        self.team.sum_gradients(self.state.model.parameters())
         norm = self.state.update(rate_at(self.phases, self.state.step, self.settings.steps))
-        means = {name: finite(sum(entry[name] for entry in entries) / batch) for name in entries[0]}
+        means = {name: finite(value) for name, value in mean_entries(self.team.gather(entries)).items()}
         seconds = round(time.monotonic() - started, 3)
         return {"step": self.state.step, **means, "gradient": finite(norm), "seconds": seconds}
 
-    def validate(self) -> dict[str, Any]:
+    def validate(self, log: "TrainingLog") -> dict[str, Any]:
         """Measure the mean network on validation scenes at the phase's size, and draw predictions and curves."""
         from .training_log import finite
         from .validation import validate
@@ -203,7 +247,7 @@ class Run:
         phase = self.phase(self.state.step - 1)
         side = self.settings.size // phase.shrink
         found = validate(self.state.mean_model(), phase, side, self.source, self.folder / PICTURES)
-        self.log.draw_curves(self.folder / CURVES, CURVES_SHOWN)
+        log.draw_curves(self.folder / CURVES, CURVES_SHOWN)
         return {name: finite(value) for name, value in found.items()}
 
     def save(self) -> None:
@@ -214,13 +258,13 @@ class Run:
 class Bar:
     """What a user sees of the run: a bar on stderr where that is a terminal, else nothing."""
 
-    def __init__(self, steps: int, done: int) -> None:
-        """`steps`: of the whole run, `done`: when it was resumed."""
+    def __init__(self, steps: int, done: int, shown: bool = True) -> None:
+        """`steps`: of the whole run, `done`: when it was resumed, `shown`: False for none at all."""
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
         columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-        self.progress = Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty())
+        self.progress = Progress(*columns, console=Console(stderr=True), disable=not (shown and sys.stderr.isatty()))
         self.task = self.progress.add_task("training", total=steps, completed=done)
 
     def show(self, entry: dict[str, Any]) -> None:
@@ -290,6 +334,15 @@ def _task(
     phases = curriculum(objective, settings.gradual)
     perceptual = load_perceptual() if any(phase.gaussians for phase in phases) else None
     return WholeTask(phases, objective, settings.seed, size, source, settings.real_ratio, perceptual)
+
+
+def _prepare_process(threads: int) -> None:
+    """Set what torch and the C library are to do in this process."""
+    import torch
+
+    _keep_memory()
+    torch.set_num_threads(threads)
+    torch.set_flush_denormal(True)
 
 
 def _keep_memory() -> None:
