@@ -32,17 +32,31 @@ class DPTConfig:
 
 
 @dataclass(frozen=True)
+class PhotoConfig:
+    """The monocular branch on the frozen features of EfficientNet-Lite0."""
+
+    # Channels of its pyramid, which is fused at a quarter of the image's size.
+    features: int = 32
+    # Channels of the coarsest map as it is handed on.
+    channels: int = 64
+    # Channels before the single disparity channel.
+    disparity_channels: int = 16
+
+
+@dataclass(frozen=True)
 class UNetConfig:
     """The U-Net that regularises costs: `levels` resolutions, cross-view attention at the coarsest."""
 
     channels: int
     levels: int
     heads: int = 4
+    # Pixels of a block that become channels, a side: a large map of few channels is slow to convolve.
+    shuffle: int = 1
 
     @property
     def side(self) -> int:
         """Height and width of its maps must be multiples of this, to halve evenly."""
-        return 2 ** (self.levels - 1)
+        return self.shuffle * 2 ** (self.levels - 1)
 
 
 @dataclass(frozen=True)
@@ -150,6 +164,8 @@ class IDESplatConfig(EncoderConfig):
     """IDESplat. The defaults are the released RealEstate10K network; the other presets differ as `PRESETS` says."""
 
     dpt: DPTConfig = DPTConfig()
+    # In place of the ViT and its DPT head.
+    photo: PhotoConfig | None = None
     dpbus: tuple[DPBUConfig, DPBUConfig, DPBUConfig] = (
         DPBUConfig(channels=256, candidates=257, scale=1, unet=UNetConfig(channels=32, levels=3)),
         DPBUConfig(channels=64, candidates=129, scale=2, unet=UNetConfig(channels=16, levels=4)),
@@ -160,11 +176,18 @@ class IDESplatConfig(EncoderConfig):
     ffn_ratio: int = 2
     ffn_kernel: int = 5
     focus: FocusConfig = FocusConfig()
+    # Hidden channels of the Gaussian head's second input, what other views show at a pixel's place; 0: it has none.
+    cross_view_channels: int = 0
 
     @property
     def unets(self) -> Iterator[tuple[int, UNetConfig]]:
         """Those of the three units."""
         return ((unit.scale, unit.unet) for unit in self.dpbus)
+
+    @property
+    def mono_channels(self) -> tuple[int, int]:
+        """Channels of the monocular branch's coarse and fine features."""
+        return (self.vit.dim, self.dpt.features) if self.photo is None else (self.photo.channels, self.photo.features)
 
 
 @dataclass(frozen=True)
@@ -207,38 +230,54 @@ _BASE = DepthSplatConfig(scales=TWO_SCALES, vit=VIT_BASE, upsampler=UPSAMPLER_BA
 _BASE_8 = replace(_BASE, feature_stride=8)
 _LARGE = DepthSplatConfig(scales=TWO_SCALES, vit=VIT_LARGE, upsampler=UPSAMPLER_LARGE)
 
+# Every part in small, for CPUs: 3.0 million parameters, trained from scratch, the ViT along.
+_TINY = IDESplatConfig(
+    backbone_channels=(24, 32, 48),
+    feature_channels=48,
+    transformer_layers=4,
+    transformer_ffn_ratio=2,
+    # Sixteen windows: at 256x256 they are 16 tokens a side, four times less work than with the releases' four.
+    attention_splits=4,
+    vit=ViTConfig(dim=96, depth=4, heads=3, grid=18, taps=(0, 1, 2, 3)),
+    dpt=DPTConfig(features=32, channels=(24, 48, 96, 96), disparity_channels=16),
+    dpbus=(
+        DPBUConfig(channels=64, candidates=97, scale=1, unet=UNetConfig(channels=40, levels=3)),
+        DPBUConfig(channels=32, candidates=25, scale=2, unet=UNetConfig(channels=16, levels=4)),
+        DPBUConfig(channels=8, candidates=9, scale=4, unet=UNetConfig(channels=8, levels=5)),
+    ),
+    residual_unet=UNetConfig(channels=8, levels=5),
+    focus=FocusConfig(channels=48, window=8, topk=(64, 64, 32, 32)),
+    cross_view_channels=16,
+    # Procedural surfaces hardly shine: bands above the first would learn little, and double the .ply file.
+    sh_degree=1,
+    scale_in_pixels=True,
+    # Training makes splats at a picture's border as large as they may be, to cover what no view sees; in views
+    # between, they cover what another photograph shows.
+    scale_max=1.5,
+    # Its scenes have the unit in which near is 1, and far lies between 2 and 200.
+    near=1.0,
+    trained_views=(2, 3),
+    other_sides=(128,),
+)
+# The same on photographic features, and without maps of many pixels and few channels: 2.5 million parameters, and 0.7
+# million of EfficientNet-Lite0.
+_LITE = replace(
+    _TINY,
+    photo=PhotoConfig(),
+    dpbus=(
+        *_TINY.dpbus[:2],
+        DPBUConfig(channels=8, candidates=9, scale=4, unet=UNetConfig(channels=16, levels=4, shuffle=2)),
+    ),
+    residual_unet=UNetConfig(channels=16, levels=4, shuffle=2),
+    trained_views=(2, 4),
+)
+
 PRESETS: dict[str, IDESplatConfig | DepthSplatConfig] = {
     "idesplat-re10k": IDESplatConfig(),
     "idesplat-acid": IDESplatConfig(),
     "idesplat-dl3dv": IDESplatConfig(feature_stride=8, far=200.0, height=256, width=448, trained_views=(2, 6)),
-    # Every part in small, for CPUs: 3.0 million parameters, trained from scratch, the ViT along.
-    "idesplat-tiny": IDESplatConfig(
-        backbone_channels=(24, 32, 48),
-        feature_channels=48,
-        transformer_layers=4,
-        transformer_ffn_ratio=2,
-        # Sixteen windows: at 256x256 they are 16 tokens a side, four times less work than with the releases' four.
-        attention_splits=4,
-        vit=ViTConfig(dim=96, depth=4, heads=3, grid=18, taps=(0, 1, 2, 3)),
-        dpt=DPTConfig(features=32, channels=(24, 48, 96, 96), disparity_channels=16),
-        dpbus=(
-            DPBUConfig(channels=64, candidates=97, scale=1, unet=UNetConfig(channels=40, levels=3)),
-            DPBUConfig(channels=32, candidates=25, scale=2, unet=UNetConfig(channels=16, levels=4)),
-            DPBUConfig(channels=8, candidates=9, scale=4, unet=UNetConfig(channels=8, levels=5)),
-        ),
-        residual_unet=UNetConfig(channels=8, levels=5),
-        focus=FocusConfig(channels=48, window=8, topk=(64, 64, 32, 32)),
-        # Procedural surfaces hardly shine: bands above the first would learn little, and double the .ply file.
-        sh_degree=1,
-        scale_in_pixels=True,
-        # Training makes splats at a picture's border as large as they may be, to cover what no view sees; in views
-        # between, they cover what another photograph shows.
-        scale_max=1.5,
-        # Its scenes have the unit in which near is 1, and far lies between 2 and 200.
-        near=1.0,
-        trained_views=(2, 3),
-        other_sides=(128,),
-    ),
+    "idesplat-tiny": _TINY,
+    "idesplat-lite": _LITE,
     "depthsplat-small-re10k": _SMALL,
     "depthsplat-base-re10k": _BASE,
     "depthsplat-large-re10k": _LARGE,

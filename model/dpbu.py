@@ -54,7 +54,7 @@ class CoarseUnit(DepthProbabilityBoostingUnit):
 
     def __init__(self, config: IDESplatConfig, unit: DPBUConfig) -> None:
         super().__init__(config, unit)
-        parts = (config.feature_channels, config.feature_channels, config.vit.dim, config.dpt.features)
+        parts = (config.feature_channels, config.feature_channels, *config.mono_channels)
         self.merge = Merge(parts, unit.channels)
 
     def forward(self, encoded: Encoded, cameras: Cameras) -> Boosted:
@@ -82,9 +82,7 @@ class FinerUnit(DepthProbabilityBoostingUnit):
         cnn = config.backbone_channels[1]
         self.grow_cnn = Upsample2x(cnn) if unit.scale > 2 else nn.Identity()
         cnn = cnn // 2 if unit.scale > 2 else cnn
-        self.merge = Merge(
-            (before.channels // 2, context // 2, cnn, config.vit.dim, config.dpt.features), unit.channels
-        )
+        self.merge = Merge((before.channels // 2, context // 2, cnn, *config.mono_channels), unit.channels)
 
     def forward(self, encoded: Encoded, before: Boosted, cameras: Cameras) -> Boosted:
         """Encoded views and the unit before -> features and inverse depth at twice its resolution."""

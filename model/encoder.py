@@ -12,6 +12,7 @@ from .dpt import DPTHead
 from .geometry import nearest_views
 from .layers import resize
 from .mv_transformer import MultiViewTransformer
+from .photo_branch import PhotoBranch
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -27,7 +28,7 @@ class Encoded(NamedTuple):
     features_cnn_fine: Tensor  # [views, cnn channels, 2h, 2w]
     features_mv: Tensor  # [views, feature channels, h, w]
     features_mono: Tensor  # [views, ViT channels, h, w]
-    mono_out: Tensor  # [views, DPT channels, 8 * patch rows, 8 * patch columns]
+    mono_out: Tensor  # [views, DPT channels, 8 * patch rows, 8 * patch columns]; of photographic features h, w
     mono_disparity: Tensor  # [views, 1, h, w], relative
 
 
@@ -52,37 +53,45 @@ class ViewEncoder(nn.Module):
 
     def __init__(self, config: EncoderConfig) -> None:
         super().__init__()
-        self.neighbours, self.patch = config.neighbours, config.vit.patch
+        self.neighbours = config.neighbours
         self.backbone = Backbone(config.backbone_channels, config.feature_channels, config.feature_stride)
         self.transformer = MultiViewTransformer(
             config.feature_channels, config.transformer_layers, config.transformer_ffn_ratio, config.attention_splits
         )
-        self.vit = DinoV2(config.vit)
+        self.vit: DinoV2 | None = None
 
     def mono_maps(self, images: Tensor) -> list[Tensor]:
         """Normalised images -> the four tapped maps of the ViT, [views, ViT channels, patch rows, patch columns]."""
-        rows, columns = images.shape[2] // self.patch, images.shape[3] // self.patch
-        return self.vit(resize(images, rows * self.patch, columns * self.patch))
+        assert self.vit is not None
+        patch = self.vit.config.patch
+        rows, columns = images.shape[2] // patch, images.shape[3] // patch
+        return self.vit(resize(images, rows * patch, columns * patch))
 
 
 class Encoder(ViewEncoder):
-    """IDESplat's: Depth Anything V2 is the monocular branch, with its head."""
+    """IDESplat's: Depth Anything V2 is the monocular branch, with its head, or else photographic features."""
 
     def __init__(self, config: IDESplatConfig) -> None:
         super().__init__(config)
-        self.dpt = DPTHead(config.vit.dim, config.vit.patch, config.dpt)
+        self.photo = PhotoBranch(config.photo) if config.photo is not None else None
+        if self.photo is None:
+            self.vit = DinoV2(config.vit)
+            self.dpt = DPTHead(config.vit.dim, config.vit.patch, config.dpt)
 
     def forward(self, images: Tensor, extrinsics: Tensor) -> Encoded:
         """Images [views, 3, H, W] in [0, 1], extrinsics [views, 4, 4] -> the encoder's maps."""
         neighbours = nearest_views(extrinsics, self.neighbours)
-        images = normalise(images)
-        cnn, cnn_fine, _ = self.backbone(images)
+        normalised = normalise(images)
+        cnn, cnn_fine, _ = self.backbone(normalised)
         mv = self.transformer(cnn, neighbours)
-        maps = self.mono_maps(images)
-        mono_out = self.dpt.features(maps)
         size = cnn.shape[2:]
-        disparity = resize(self.dpt.disparity(mono_out, *maps[-1].shape[2:]), *size)
-        return Encoded(neighbours, cnn, cnn_fine, mv, resize(maps[-1], *size), mono_out, disparity)
+        if self.photo is not None:
+            mono, mono_out, disparity = self.photo(images)
+        else:
+            maps = self.mono_maps(normalised)
+            mono, mono_out = maps[-1], self.dpt.features(maps)
+            disparity = self.dpt.disparity(mono_out, *mono.shape[2:])
+        return Encoded(neighbours, cnn, cnn_fine, mv, resize(mono, *size), mono_out, resize(disparity, *size))
 
 
 class PyramidEncoder(ViewEncoder):
@@ -90,6 +99,7 @@ class PyramidEncoder(ViewEncoder):
 
     def __init__(self, config: DepthSplatConfig) -> None:
         super().__init__(config)
+        self.vit = DinoV2(config.vit)
         # The releases bring the ViT's maps to this stride first, and from there to a finer feature stride.
         self.growth = MONO_STRIDE // config.feature_stride
 

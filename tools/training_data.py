@@ -4,6 +4,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -18,6 +19,8 @@ THREE_VIEW_SHARE = 0.06
 CLOSEST = 4
 # Scenes drawn ahead of their use.
 AHEAD = 4
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,7 @@ class Order:
     """One scene as a step wants it.
 
     closer: for each target how many times as large as the context it is drawn, a window of it.
+    real: whether the views are those of a capture, where a run has both kinds.
     """
 
     seed: int
@@ -47,6 +51,7 @@ class Order:
     closer: tuple[int, ...]
     height: int
     width: int
+    real: bool = False
 
 
 def to_views(sample: Sample) -> Views:
@@ -74,22 +79,25 @@ def draw_views(order: Order) -> Views:
     return to_views(draw_sample(order.seed, order.context, targets, order.height, order.width, closer=order.closer))
 
 
-def training_order(seed: int, step: int, slot: int, rendered: bool, height: int, width: int, many: bool) -> Order:
+def training_order(
+    seed: int, step: int, slot: int, rendered: bool, height: int, width: int, many: bool, real_ratio: float = 0.0
+) -> Order:
     """The scene at place `slot` of a step's batch, drawn from the run's seed and the step alone.
 
     rendered: whether it has novel views. many: whether some scenes are to have three context views.
+    real_ratio: share of the scenes that are captures.
     """
     rng = np.random.default_rng((seed, step, slot))
     context = 3 if many and rng.random() < THREE_VIEW_SHARE else 2
     scene = int(rng.integers(TRAINING_SEEDS.start, TRAINING_SEEDS.stop))
     closer = (1, int(rng.integers(2, CLOSEST + 1))) if rendered else ()
-    return Order(scene, context, closer, height, width)
+    return Order(scene, context, closer, height, width, real=bool(rng.random() < real_ratio))
 
 
-def drawn_ahead(orders: Iterator[Order], draw: Callable[[Order], Views] = draw_views) -> Generator[Views]:
+def drawn_ahead(orders: Iterator[Order], draw: Callable[[Order], T]) -> Generator[T]:
     """The scenes of `orders`, in that order, drawn by a thread while the caller is at work."""
     with ThreadPoolExecutor(1, thread_name_prefix="scenes") as pool:
-        waiting: deque[Future[Views]] = deque()
+        waiting: deque[Future[T]] = deque()
         try:
             for order in orders:
                 waiting.append(pool.submit(draw, order))

@@ -24,7 +24,9 @@ from .training_data import Order, Views
 CAMERAS = "transforms.json"
 # The other context views are drawn from this many cameras nearest to the first one, the targets from as many nearest
 # to the middle of the context.
-NEIGHBOURHOOD = 8
+NEIGHBOURHOOD = 4
+# A camera that looks this much elsewhere counts as standing twice as far away.
+TURN_DEG = 30.0
 # One of so many photographs is held out, from the first, as in the published splits of such captures.
 HOLD_OUT_EVERY = 8
 FEWEST_CONTEXT, FEWEST_TARGETS = 2, 2
@@ -129,10 +131,12 @@ def _choose(rng: np.random.Generator, pairs: Pairs, targets: int, context: int) 
     """Indices of context views, as many as there are photographs for, and then of target views."""
     context = min(context, len(pairs) - targets)
     places = _places(pairs)
+    forward = np.stack([camera.extrinsics[:3, 2] for _, camera in pairs])
     chosen = [int(rng.integers(len(places)))]
     for count in (context - 1, targets):
         rest = np.setdiff1d(np.arange(len(places)), chosen)
-        distances = np.linalg.norm(places[rest] - places[chosen].mean(axis=0), axis=1)
+        turns = np.degrees(np.arccos(np.clip((forward[rest] @ forward[chosen].T).min(axis=1), -1, 1)))
+        distances = np.linalg.norm(places[rest] - places[chosen].mean(axis=0), axis=1) * (1 + (turns / TURN_DEG) ** 2)
         nearest = rest[np.argsort(distances)][: max(NEIGHBOURHOOD, count)]
         chosen += [int(index) for index in rng.choice(nearest, count, replace=False)]
     return chosen

@@ -23,29 +23,47 @@ WEIGHT_DECAY = 0.01
 LARGEST_GRADIENT = 1.0
 # The optimiser's groups, in this order.
 BACKBONE_PREFIX = "encoder.vit."
+# Weights that were trained on photographs elsewhere, and stay as they are.
+FROZEN_PREFIX = "encoder.photo.network."
+# A part that older checkpoints lack. As it is made, it changes nothing.
+OPTIONAL_PREFIX = "gaussians.cross_view."
 
 
 class TrainingState:
     """The network in training. `step` counts the steps done."""
 
-    def __init__(self, config: IDESplatConfig, seed: int, lr: float, vit_lr: float) -> None:
-        """A new network drawn from `seed`; learning rates at their highest, the ViT's and that of the rest."""
+    def __init__(
+        self, config: IDESplatConfig, seed: int, lr: float, vit_lr: float, trained: tuple[str, ...] = ("",)
+    ) -> None:
+        """A new network drawn from `seed`; learning rates at their highest, the ViT's and that of the rest.
+
+        trained: the beginnings of the names of the parameters that are trained; all others are frozen.
+        """
         self.model = with_compiled_products(new_model(config, seed))
         self.mean = {name: value.clone() for name, value in self.model.state_dict().items()}
         self.step = 0
-        parameters = list(self.model.named_parameters())
+        for name, parameter in self.model.named_parameters():
+            parameter.requires_grad_(name.startswith(trained) and not name.startswith(FROZEN_PREFIX))
+        parameters = [(name, p) for name, p in self.model.named_parameters() if p.requires_grad]
         groups = [
             {"params": [p for name, p in parameters if not name.startswith(BACKBONE_PREFIX)], "highest": lr},
             {"params": [p for name, p in parameters if name.startswith(BACKBONE_PREFIX)], "highest": vit_lr},
         ]
+        groups = [group for group in groups if group["params"]]
         self.optimizer = torch.optim.AdamW(groups, lr=lr, weight_decay=WEIGHT_DECAY, fused=True)
 
     def start_from(self, path: Path) -> None:
         """Take the weights of a checkpoint, released or own; raises InputError if it does not fit the network."""
         try:
-            fill(self.model, read_state_dict(path), path)
+            tensors = read_state_dict(path)
+            made = self.model.state_dict()
+            fill(self.model, {name: made[name] for name in made if name.startswith(OPTIONAL_PREFIX)} | tensors, path)
         except CheckpointError as error:
             raise InputError(str(error)) from None
+        self.reset_mean()
+
+    def reset_mean(self) -> None:
+        """Start the running mean anew, with the weights as they are."""
         self.mean = {name: value.clone() for name, value in self.model.state_dict().items()}
 
     def update(self, rate: float) -> float:

@@ -127,5 +127,10 @@ def measures(outcome: Outcome, views: Views) -> dict[str, float]:
         error = (views.inverse_depth / inverse_depth - 1).abs()
         entry = {"abs_rel": float(error.mean()), "within": float((error < WITHIN).float().mean())}
     if outcome.rendered is not None:
-        entry["psnr"] = float(-10 * (outcome.rendered - views.target_images).square().mean().log10())
+        entry["psnr"] = psnr_of(outcome.rendered, views.target_images)
     return entry
+
+
+def psnr_of(rendered: Tensor, truth: Tensor) -> float:
+    """PSNR in dB over all of some images, [views, 3, H, W]."""
+    return float(-10 * (rendered - truth).square().mean().log10())
