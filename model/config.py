@@ -247,7 +247,6 @@ _TINY = IDESplatConfig(
     ),
     residual_unet=UNetConfig(channels=8, levels=5),
     focus=FocusConfig(channels=48, window=8, topk=(64, 64, 32, 32)),
-    cross_view_channels=16,
     # Procedural surfaces hardly shine: bands above the first would learn little, and double the .ply file.
     sh_degree=1,
     scale_in_pixels=True,
@@ -259,10 +258,12 @@ _TINY = IDESplatConfig(
     trained_views=(2, 3),
     other_sides=(128,),
 )
-# The same on photographic features, and without maps of many pixels and few channels: 2.5 million parameters, and 0.7
+# The same with a Gaussian head that is shown what other views see at a pixel's place.
+_TINY_CROSS_VIEW = replace(_TINY, cross_view_channels=16)
+# That on photographic features, and without maps of many pixels and few channels: 2.5 million parameters, and 0.7
 # million of EfficientNet-Lite0.
 _LITE = replace(
-    _TINY,
+    _TINY_CROSS_VIEW,
     photo=PhotoConfig(),
     dpbus=(
         *_TINY.dpbus[:2],
@@ -277,6 +278,7 @@ PRESETS: dict[str, IDESplatConfig | DepthSplatConfig] = {
     "idesplat-acid": IDESplatConfig(),
     "idesplat-dl3dv": IDESplatConfig(feature_stride=8, far=200.0, height=256, width=448, trained_views=(2, 6)),
     "idesplat-tiny": _TINY,
+    "idesplat-tiny-cross-view": _TINY_CROSS_VIEW,
     "idesplat-lite": _LITE,
     "depthsplat-small-re10k": _SMALL,
     "depthsplat-base-re10k": _BASE,

@@ -48,7 +48,7 @@ def test_frames_held_out_by_number() -> None:
     """As in LLFF's split: frames 0, 8, 16 and on."""
     frames = on_a_line(20)
     assert chosen_frames(frames, [], [], 2, 8) == [([1, 2], [0]), ([7, 9], [8]), ([15, 17], [16])]
-    assert chosen_frames(frames, [], [], 2, 2)[1:3] == [([1, 3], [2]), ([3, 5], [4])]
+    assert chosen_frames(frames, [], [], 2, 2)[:2] == [([1, 3], [0, 2]), ([3, 5], [4])]
     assert chosen_frames(on_a_line(5), [], [], 2, 8) == [([1, 2], [0])]
     assert chosen_frames(frames, [], ["0004", "0005"], 2, 8) == [([3, 6], [4, 5])]  # the held out are no context
 

@@ -388,10 +388,10 @@ def test_validation_renders_photographs_that_training_never_uses(
     settings = replace(SETTINGS, objective="photometric", data=[str(scene)])
     run = Run(tmp_path, settings, SMALL)
     for seed in range(40):
-        run.draw(Order(seed, 2, (1, 2), 64, 64))
+        run.source(Order(seed, 2, (1, 2), 64, 64))
     now = "validate"
     for seed in range(5):
-        run.draw_validation(Order(seed, 2, (1,), 64, 64))
+        run.held_out(Order(seed, 2, (1,), 64, 64))
     assert used == {"train": {"001.png", "002.png", "003.png", "004.png"}, "validate": {"000.png"}}
 
 
