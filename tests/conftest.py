@@ -2,7 +2,9 @@
 
 import os
 import shutil
+import signal
 import sys
+from functools import partial
 from pathlib import Path
 
 # Compiled code is kept between test runs, but not in the user's cache.
@@ -45,6 +47,10 @@ def small_network() -> IDESplat:
     """The small network with weights that are always the same."""
     torch.manual_seed(0)
     return IDESplat(SMALL).eval()
+
+
+# For `preexec_fn`: a shell starts commands in the background with SIGINT ignored, and what is ignored stays so.
+USUAL_SIGINT = None if os.name == "nt" else partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
 
 
 def run_command(main, *arguments) -> int:

@@ -8,12 +8,12 @@ import socket
 import subprocess
 import sys
 import time
-from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from conftest import USUAL_SIGINT
 from idesplat.runtime.default_model import default_model
 from idesplat.runtime.files import replacing, scratch_folder
 from idesplat.runtime.gaussians import with_colours
@@ -230,9 +230,8 @@ run(wait)
 def test_signals_clean_up(tmp_path, number, status):
     out = tmp_path / "out.txt"
     command = [sys.executable, "-P", "-c", WAITING, out]
-    # A shell starts commands in the background with SIGINT ignored, and what is ignored stays so.
-    usual = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
-    waiting = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=usual)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    waiting = subprocess.Popen(command, **pipes, preexec_fn=USUAL_SIGINT)
     assert waiting.stdout.readline() == "waiting\n"
     waiting.send_signal(number)
     printed = waiting.communicate(timeout=60)

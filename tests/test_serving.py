@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from conftest import run_command
+from conftest import USUAL_SIGINT, run_command
 from idesplat.runtime.gaussians import with_colours
 from idesplat.runtime.ply import write_ply
 from idesplat.runtime.serving import address, free_port, is_own_page, only_own_page
@@ -54,7 +54,8 @@ def served(scene):
     def serve(*arguments):
         command = [sys.executable, "-P", "-c", "from idesplat.runtime.view import main; main()", str(scene)]
         command += ["--no-browser", *map(str, arguments)]
-        processes.append(subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        processes.append(subprocess.Popen(command, **pipes, preexec_fn=USUAL_SIGINT))
         line = processes[-1].stdout.readline()
         return next(word for word in line.split() if word.startswith("http://")), processes[-1]
 

@@ -15,6 +15,7 @@ from idesplat.export.room import room_inputs
 from idesplat.export.stages import NamedTensors, Stage
 from idesplat.export.verify import FUSED, NEAREST, STAGED, Exported, Figures, TensorError, compare
 from idesplat.runtime.bundle import INPUTS, read_description, read_manifest
+from idesplat.runtime.errors import InputError
 from onnx import helper, numpy_helper
 
 FAR_END = np.iinfo(np.int64).max
@@ -212,7 +213,7 @@ def test_a_fault_in_a_staged_export_is_caught_in_its_stage_and_end_to_end(export
 def test_a_stage_that_is_right_by_itself_is_caught_if_it_is_not_given_what_it_reads(exported, cases):
     """Stages in the wrong order, or one too few, fail in a row even if each alone does not."""
     stages = stages_of(exported[1])
-    with pytest.raises(KeyError, match="dpbu2"):
+    with pytest.raises(InputError, match="dpbu2"):
         list(compare(Exported([*stages[:2], *stages[3:]]), cases[1:2], NEAREST))
 
 
