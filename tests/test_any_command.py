@@ -2,7 +2,6 @@
 
 import inspect
 import json
-import os
 import shutil
 import tempfile
 import typing
@@ -21,11 +20,11 @@ from hypothesis import strategies as st
 from idesplat.export import cli as export
 from idesplat.runtime import cli as infer
 from idesplat.runtime import convert, convert_cameras, render, view
-from idesplat.runtime.bundle import MANIFEST_NAME, StageFile, write_manifest
-from idesplat.runtime.cameras import read_cameras, write_cameras
+from idesplat.runtime.bundle import StageFile, write_manifest
+from idesplat.runtime.cameras import write_cameras
 from idesplat.runtime.errors import printable
 from idesplat.runtime.files import SCRATCH_PREFIX
-from idesplat.tools import bench, captures, checkouts, evaluate, train
+from idesplat.tools import bench, checkouts, evaluate, train
 from mutations import TEXTS, make_odd_paths, mutated, mutated_json, tried
 from test_chunks import as_scene
 from test_outputs import pinholes, snapshot, write_scene
@@ -41,108 +40,98 @@ class Command:
 
     function: Callable
     main: Callable
-    words: tuple[str, ...]
+    words: str
     reads: tuple[str, ...]
     examples: int
 
 
 POSED = ("images/000.png", "images/001.png", "transforms.json")
-MODEL = ("--model", "model.onnx", "--near", "1", "--far", "10", "--size", "32x48")
-PHOTOGRAPHS = ("--images", "images", "--cameras", "transforms.json")
+MODEL = "--model model.onnx --near 1 --far 10"
+PHOTOGRAPHS = "--images images --cameras transforms.json"
 COMMANDS = {
     "infer": Command(
-        infer.infer, infer.main, (*PHOTOGRAPHS, *MODEL, "--out", "out/a.ply"), (*POSED, "model.onnx"), 60
+        infer.infer, infer.main, f"{PHOTOGRAPHS} {MODEL} --size 32x48 --out out/a.ply", (*POSED, "model.onnx"), 40
     ),
     "infer all": Command(
         infer.infer,
         infer.main,
-        (*PHOTOGRAPHS, *MODEL, "--out", "out/a.spz", "--save-depth", "out/depth", "--json", "out/a.json")
-        + ("--report", "out/a.html", "--save-cameras", "out/c.json", "--views", "2", "--offset", "auto"),
+        f"{PHOTOGRAPHS} {MODEL} --size 32x48 --views 2 --offset auto --out out/a.spz --save-depth out/depth "
+        "--json out/a.json --report out/a.html --save-cameras out/c.json",
         (*POSED, "model.onnx"),
-        20,
+        15,
     ),
     "render": Command(
         render.render,
         render.main,
-        ("scene.ply", "--cameras", "transforms.json", "--out", "out", "--size", "16x24", "--background", "1,0,1"),
+        "scene.ply --cameras transforms.json --out out --size 16x24 --background 1,0,1",
         ("scene.ply", "transforms.json"),
-        60,
+        40,
     ),
     "orbit": Command(
         render.render,
         render.main,
-        ("scene.ply", "--orbit", "--frames", "2", "--out", "out", "--size", "16x24", "--depth", "--degrees", "20"),
+        "scene.ply --orbit --frames 2 --out out --size 16x24 --depth --degrees 20",
         ("scene.ply",),
-        30,
+        20,
     ),
-    "convert": Command(
-        convert.convert, convert.main, ("scene.ply", "out/a.splat", "--min-opacity", "0.1"), ("scene.ply",), 60
-    ),
+    "convert": Command(convert.convert, convert.main, "scene.ply out/a.splat --min-opacity 0.1", ("scene.ply",), 40),
     "cameras": Command(
         convert_cameras.convert,
         convert_cameras.main,
-        ("convert", "transforms.json", "out/c.json", "--images", "images"),
+        "convert transforms.json out/c.json --images images",
         POSED,
-        60,
+        40,
     ),
-    "view": Command(
-        view.view,
-        view.main,
-        ("scene.ply", "--cameras", "transforms.json", "--images", "images", "--html", "out/a.html"),
-        ("scene.ply", *POSED),
-        30,
-    ),
+    "view": Command(view.view, view.main, f"scene.ply {PHOTOGRAPHS} --html out/a.html", ("scene.ply", *POSED), 30),
     "export": Command(
         export.export,
         export.main,
-        ("last.ckpt", "out/a.onnx", "--views", "2", "--size", "64x96", "--preset", "idesplat-tiny"),
+        "last.ckpt out/a.onnx --views 2 --size 64x96 --preset idesplat-tiny",
         ("last.ckpt",),
-        40,
+        30,
     ),
     "eval scene": Command(
         evaluate.scene,
         evaluate.main,
-        ("scene", "images", "--cameras", "transforms.json", "--out", "out", *MODEL)
-        + ("--context", "000", "--context", "001", "--target", "002", "--depth", "depth"),
+        f"scene images --cameras transforms.json --out out {MODEL} --size 32x48 --context 000 --context 001 "
+        "--target 002 --depth depth",
         (*POSED, "model.onnx", "depth/000.npz"),
-        30,
+        20,
     ),
     "eval chunks": Command(
         evaluate.chunks,
         evaluate.main,
-        ("chunks", "chunks", "--index", "index.json", "--out", "out", *MODEL[:6]),
+        f"chunks chunks --index index.json --out out {MODEL}",
         ("chunks/0.torch", "index.json", "model.onnx"),
-        20,
+        15,
     ),
     "eval procedural": Command(
         evaluate.procedural,
         evaluate.main,
-        ("procedural", "--model", "missing.onnx", "--out", "out", "--scenes", "1", "--size", "32x48"),
+        "procedural --model missing.onnx --out out --scenes 1 --size 32x48",
         (),
         15,
     ),
     "eval captures": Command(
         evaluate.captures,
         evaluate.main,
-        ("captures", "--checkouts", "checkouts", "--out", "out", "--views", "2", "--size", "32x48", *MODEL[:2]),
+        "captures --checkouts checkouts --out out --views 2 --size 32x48 --model model.onnx",
         ("model.onnx",),
         15,
     ),
     "bench": Command(
         bench.bench,
         bench.main,
-        ("missing.onnx", "--views", "2", "--sizes", "32x48", "--repeats", "1", "--threads", "1", "--no-eager")
-        + ("--json", "out/b.json", "--compare", "rows.json"),
+        "missing.onnx --views 2 --sizes 32x48 --repeats 1 --threads 1 --no-eager --json out/b.json --compare rows.json",
         ("rows.json",),
         15,
     ),
     "train": Command(
         train.train,
         train.main,
-        ("--out", "out", "--preset", SMALL_PRESET, "--steps", "1", "--batch", "1", "--size", "64", "--data", ".")
-        + ("--objective", "photometric"),
+        f"--out out --preset {SMALL_PRESET} --objective photometric --steps 1 --batch 1 --size 64 --data .",
         POSED,
-        20,
+        15,
     ),
 }
 
@@ -218,7 +207,7 @@ def options_of(function: Callable) -> list[tuple[str, bool]]:
 @st.composite
 def calls(draw: st.DrawFn, command: Command, odd: list[str], good: Path) -> tuple[list[str], dict[str, bytes]]:
     """The words of a call with one to three things wrong, and the files whose content is another meanwhile."""
-    words, files = list(command.words), {}
+    words, files = command.words.split(), {}
     options = options_of(command.function)
     assert options, command
     values = st.sampled_from(TEXTS) | st.sampled_from(odd) | st.text(max_size=6)
@@ -248,7 +237,7 @@ def assert_shown(text: str) -> None:
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_any_call_succeeds_or_changes_nothing(
-    name: str, good: Path, place: Path, capfd: pytest.CaptureFixture[str]
+    name: str, good: Path, place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command, odd = COMMANDS[name], make_odd_paths(place)
     (place / "checkouts").mkdir()
@@ -261,11 +250,11 @@ def test_any_call_succeeds_or_changes_nothing(
         for changed, content in files.items():
             (place / changed).write_bytes(content)
         before = snapshot(root)
-        capfd.readouterr()
+        capsys.readouterr()
         try:
             if not serves(command, words):
                 status = run_command(command.main, *words)
-                check_result(status, *capfd.readouterr(), before, root)
+                check_result(status, *capsys.readouterr(), before, root)
         finally:
             restore(before, root)
             for changed in files:
@@ -302,10 +291,10 @@ def restore(before: dict, root: Path) -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in COMMANDS if "missing.onnx" not in COMMANDS[name].words])
-def test_the_good_calls_get_far(name: str, place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_good_calls_get_far(name: str, place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Or else nothing is tried but how the first mistake is refused."""
     (place / "checkouts").mkdir()
-    status = run_command(COMMANDS[name].main, *COMMANDS[name].words)
-    err = capfd.readouterr().err.replace(LPIPS_IS_MISSING, "")
+    status = run_command(COMMANDS[name].main, *COMMANDS[name].words.split())
+    err = capsys.readouterr().err.replace(LPIPS_IS_MISSING, "")
     late = {"export": "does not fit the network", "eval captures": "no network", "train": "expected at least"}
     assert (status, err) == (0, "") if name not in late else late[name] in err, err

@@ -1,6 +1,6 @@
 """Choose the frames of the validation captures and write `captures.json`.
 
-    python -m idesplat.tools.choose_captures --checkouts DIR --work DIR
+    python -P -m idesplat.tools.choose_captures --checkouts DIR --work DIR
 
 For each capture: cameras from the repository, or estimated from the images; SIFT matches between neighbouring frames
 give the scene's depth and the epipolar distance, and frames whose cameras do not fit are left out. A triple is two

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..runtime.errors import InputError, exit_on_input_error
-from ..runtime.files import make_folder
 from ..runtime.outputs import Overwrite, guards_outputs, outputs
 from ..runtime.terminal import run, say
 from .curriculum import Objective, Phase, curriculum, phase_at, rate_at
@@ -89,7 +88,8 @@ def train(
 
     torch.set_num_threads(threads)
     torch.set_flush_denormal(True)
-    Run(make_folder(out), settings, config).go(save_every * 60, validate_every)
+    outputs().make_folder(out)
+    Run(out, settings, config).go(save_every * 60, validate_every)
 
 
 class Run:

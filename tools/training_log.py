@@ -49,7 +49,7 @@ def _read(path: Path) -> list[dict[str, Any]]:
 
     Raises InputError for any other line that this module does not write: rewriting the log would lose it.
     """
-    if not path.exists() or not path.stat().st_size:
+    if not path.exists() or (path.is_file() and not path.stat().st_size):
         return []
     lines = read_bytes(path, "the log of a training run").decode(errors="replace").split("\n")
     entries = []
