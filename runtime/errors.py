@@ -16,6 +16,7 @@ from typing import Any, NoReturn
 EXIT_STATUS = 2
 SIGNALLED = 128  # a shell's exit status of a command that a signal ended is this and the signal's number
 BROKEN_PIPE = SIGNALLED + 13  # SIGPIPE, which Windows does not name
+LONGEST_ERROR = 2000  # characters: an option, or a name in a file, may have any length
 
 
 class InputError(ValueError):
@@ -44,9 +45,12 @@ def printable(text: str) -> str:
 
 
 def report_error(message: str) -> None:
-    """Print an error as one line on stderr, where that can be written."""
+    """Print an error as one line on stderr, where that can be written; of a very long one, beginning and end."""
+    line = printable(" ".join(message.split()))
+    if len(line) > LONGEST_ERROR:
+        line = f"{line[: LONGEST_ERROR // 2]} ... {line[-LONGEST_ERROR // 2 :]}"
     with contextlib.suppress(OSError):
-        print(f"error: {printable(' '.join(message.split()))}", file=sys.stderr)
+        print(f"error: {line}", file=sys.stderr)
 
 
 def exit_on_input_error(command: Callable[..., Any]) -> Callable[..., Any]:

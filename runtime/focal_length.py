@@ -1,5 +1,6 @@
 """The focal length of a photograph in pixels: as the user gives it, or from its EXIF data."""
 
+import math
 import re
 from pathlib import Path
 
@@ -20,7 +21,7 @@ def given_focal(text: str, width: int, height: int) -> float:
     Raises InputError.
     """
     found = GIVEN.fullmatch(text.strip())
-    if not found or float(found[1]) == 0:
+    if not found or not 0 < float(found[1]) < math.inf:
         raise InputError(
             f"--focal {text}: expected pixels, such as 1375, or what a lens is on 35 mm film, such as 26mm"
         )

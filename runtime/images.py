@@ -15,6 +15,7 @@ from .cameras import Camera
 from .errors import InputError
 from .files import read_bytes
 from .image_header import HEIF, DamagedImage, ImageHeader, opened, read_header
+from .video import SUFFIXES as VIDEO_SUFFIXES
 
 # Images that are read.
 SUFFIXES = (
@@ -167,7 +168,7 @@ def _images_of(item: str | Path) -> list[Path]:
     expected = f"expected {', '.join(SUFFIXES)}"
     files = _files_of(item)
     if path.is_file() and path.suffix.lower() not in SUFFIXES:
-        raise InputError(f"{path}: not an image by its suffix; {expected}")
+        raise InputError(f"{path}: not an image by its suffix; {expected}, or one video ({', '.join(VIDEO_SUFFIXES)})")
     if not files and not path.is_dir():
         raise InputError(f"{item}: no such file or folder, nor a pattern that matches one; expected images")
     images = [file for file in files if _is_image(file)]

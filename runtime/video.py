@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from .errors import InputError
+from .files import check_regular
 from .image_header import check_megapixels
 from .limits import whole_number
 from .progress import working
@@ -94,8 +95,12 @@ def _sharpness_of(frame: np.ndarray) -> float:
 
 def _frames(video: Path) -> Iterator[tuple[int, cv2.VideoCapture]]:
     """The number of each frame, with the capture from which it can be retrieved."""
-    if not video.is_file():
-        raise InputError(f"{video}: no such file, expected a video")
+    try:
+        check_regular(video)
+    except FileNotFoundError:
+        raise InputError(f"{video}: no such file, expected a video") from None
+    except OSError as error:
+        raise InputError(f"{video}: cannot be read ({error.strerror}); expected a video") from None
     capture = cv2.VideoCapture(str(video))
     try:
         if capture.isOpened():

@@ -419,6 +419,9 @@ def test_messages_of_libraries_are_shown_beside_our_own_mistakes():
 
 SPLATS = ("scene.ply", "scene.compressed.ply", "scene.splat", "scene.spz", "scene.sog", "scene.glb")
 CAMERAS = ("transforms.json", "own.json", "pose.txt", "stereo.yml", "poses_bounds.npy", "a_cam.txt", "cameras")
+OTHERS = ("model.onnx", "index.json", "rows.json", "chunk.torch")
+# Where cameras do not find them.
+ELSEWHERE = ("a.png", "manifest.json", "clip.mp4", "captures.json", "log.jsonl", "a.ckpt", "a.safetensors")
 
 
 @POSIX
@@ -426,7 +429,8 @@ CAMERAS = ("transforms.json", "own.json", "pose.txt", "stereo.yml", "poses_bound
 def test_readers_take_regular_files_alone(tmp_path, kind):
     """In one process, whose limit ends what would hang; every reader names what it met."""
     with contextlib_socket() as listener:
-        for name in (*SPLATS, *CAMERAS, "model.onnx", "index.json", "rows.json", "chunk.torch"):
+        (tmp_path / "else").mkdir()
+        for name in (*SPLATS, *CAMERAS, *OTHERS, *(f"else/{name}" for name in ELSEWHERE)):
             make_special(tmp_path / name, kind, listener)
         code = (
             "import sys\n"
@@ -436,29 +440,45 @@ def test_readers_take_regular_files_alone(tmp_path, kind):
             "from idesplat.runtime.session import open_session\n"
             "from idesplat.tools.bench_report import read_rows\n"
             "from idesplat.tools.chunks import read_chunk, read_index\n"
+            "from idesplat.model.checkpoint import file_sha256, read_state_dict\n"
+            "from idesplat.runtime.bundle import read_manifest\n"
+            "from idesplat.runtime.image_header import image_size\n"
+            "from idesplat.runtime.images import load_image\n"
+            "from idesplat.runtime.video import sample_frames\n"
+            "from idesplat.tools.captures import read_captures\n"
+            "from idesplat.tools.training_log import TrainingLog\n"
             f"splats, cameras = {SPLATS!r}, {CAMERAS!r}\n"
             "forms = [CameraFormat.TRANSFORMS, CameraFormat.OWN, CameraFormat.RE10K, CameraFormat.OPENCV,\n"
             "         CameraFormat.LLFF, CameraFormat.DTU]\n"
             "tries = [(read_scene, name) for name in splats] + [(read_cameras, name) for name in cameras]\n"
             "tries += [(lambda p, form=form: read_cameras(p, (), form), name) for form, name in zip(forms, cameras)]\n"
             "tries += [(open_session, 'model.onnx'), (read_index, 'index.json'), (read_rows, 'rows.json')]\n"
-            "tries += [(read_chunk, 'chunk.torch')]\n"
+            "tries += [(read_chunk, 'chunk.torch'), (image_size, 'else/a.png'), (load_image, 'else/a.png')]\n"
+            "tries += [(lambda path: read_manifest(path.parent), 'else/manifest.json')]\n"
+            "tries += [(lambda path: sample_frames(path, Path()), 'else/clip.mp4')]\n"
+            "tries += [(lambda path: read_captures(path=path), 'else/captures.json')]\n"
+            "tries += [(lambda path: TrainingLog(path, 0), 'else/log.jsonl')]\n"
+            "names = ('else/a.ckpt', 'else/a.safetensors')\n"
+            "tries += [(read, name) for read in (read_state_dict, file_sha256) for name in names]\n"
             "for reader, name in tries:\n"
             "    try:\n"
             "        reader(Path(name))\n"
             "        print(name, 'was read')\n"
             "    except ValueError as error:\n"
-            "        print(name, type(error).__name__, error)\n"
+            "        print(name, *[kind.__name__ for kind in type(error).mro()], error)\n"
         )
         done = subprocess.run(
             [sys.executable, "-P", "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=120
         )
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
-    assert len(lines) == len(SPLATS) + 2 * len(CAMERAS) - 1 + 4
+    assert len(lines) == len(SPLATS) + 2 * len(CAMERAS) - 1 + 14
     if kind == "a folder":  # some formats of cameras are folders
         lines = [line for line in lines if line.split()[0] not in CAMERAS]
-    assert [line for line in lines if "InputError" not in line or kind not in line] == []
+    checkpoints = [line for line in lines if "CheckpointError" in line and "not a regular file" in line]
+    assert len(checkpoints) == 4
+    rest = [line for line in lines if line not in checkpoints]
+    assert [line for line in rest if "InputError" not in line or kind not in line] == []
 
 
 def contextlib_socket() -> socket.socket:

@@ -108,7 +108,7 @@ def read_rows(path: Path) -> list[Row]:
         return [Row(**entry) for entry in json.loads(read_bytes(path, "what --json of idesplat-bench wrote"))["rows"]]
     except InputError:
         raise
-    except (ValueError, TypeError, KeyError):
+    except (ValueError, TypeError, LookupError, RecursionError):
         raise InputError(f"{path}: not what --json of this version of idesplat-bench writes") from None
 
 

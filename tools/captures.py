@@ -29,6 +29,7 @@ from ..runtime.cameras import Camera, located
 from ..runtime.depth_range import DepthRange
 from ..runtime.errors import InputError
 from ..runtime.images import load_image
+from ..runtime.limits import whole_number
 from ..runtime.quaternions import rotation_matrices
 from ..runtime.views import Views, take
 from .cases import Case, Posed
@@ -161,10 +162,10 @@ def read_captures(names: Sequence[str] = (), path: Path | None = None) -> list[C
 
 def parse_view_counts(text: str) -> list[int]:
     """The option --views, such as `2,6`: numbers of context views, in rising order; raises InputError."""
-    words = [word.strip() for word in text.split(",")]
-    if not all(word.isascii() and word.isdigit() and PAIR <= int(word) <= MOST_VIEWS for word in words):
+    counts = [whole_number(word.strip()) or 0 for word in text.split(",")]
+    if not all(PAIR <= count <= MOST_VIEWS for count in counts):
         raise InputError(f"--views {text}: expected numbers from {PAIR} to {MOST_VIEWS} with commas, such as 2,6")
-    return sorted({int(word) for word in words})
+    return sorted(set(counts))
 
 
 def _capture(entry: dict[str, Any]) -> Capture:
@@ -174,12 +175,17 @@ def _capture(entry: dict[str, Any]) -> Capture:
             cameras = {frame[0]: _camera(entry["lenses"], frame) for frame in entry["frames"]}
             triples = [Triple((first, second), target) for first, second, target in entry["triples"]]
             described = {text: entry[text] for text in texts}
+            if not all(isinstance(text, str) for text in described.values()):
+                raise TypeError(f"{', '.join(texts)} are not all strings")
             capture = Capture(
                 **described, cameras=cameras, triples=triples, views=entry["views"], between=entry["between"]
             )
         except (KeyError, IndexError, TypeError, ValueError) as error:
             raise InputError(f"is not as this version writes it ({error}); restore the file") from None
-        _check_frames(capture)
+        try:
+            _check_frames(capture)
+        except TypeError as error:
+            raise InputError(f"is not as this version writes it ({error}); restore the file") from None
     return capture
 
 

@@ -48,6 +48,8 @@ def read_index(path: Path) -> dict[str, Entry]:
         content = json.loads(read_bytes(path, "an evaluation index"))
     except InputError:
         raise
+    except RecursionError:
+        raise InputError(f"{path}: is JSON nested too deeply; expected an evaluation index") from None
     except ValueError as error:
         raise InputError(f"{path}: is not valid JSON ({error}); expected an evaluation index") from None
     if not isinstance(content, dict):

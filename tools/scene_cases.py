@@ -1,5 +1,6 @@
 """Cases from a folder of photographs: some are held out, and for each of those a context is chosen among the rest."""
 
+import math
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -24,6 +25,8 @@ TURN_DEG = 30.0
 BLACK, JPEG_BLOCK = 8, 8
 # Pixels at the network's size that are left out beside what the camera did not see.
 MARGIN = 2
+DEPTH = "depth"  # in an .npz of true depth
+NPY_HEADER_BYTES, MOST_BYTES_A_DEPTH = 1 << 16, 16
 LEAST_VALID = 0.1  # of a picture's pixels
 
 
@@ -150,15 +153,20 @@ def _fitted_depth(folder: Path, path: Path, camera: Camera, height: int, width: 
     file = folder / f"{path.stem}.npz"
     if camera.distortion is not None:
         raise InputError(f"{path}: has lens distortion; true depth can only be compared for undistorted photographs")
+    shape = image_size(path)[::-1]
     try:
         check_regular(file)
         with np.load(file) as content:
-            depth = content["depth"]
+            if content.zip.getinfo(f"{DEPTH}.npy").file_size > NPY_HEADER_BYTES + MOST_BYTES_A_DEPTH * math.prod(shape):
+                raise InputError(f"{file}: holds more than depth of shape {shape}, the size of {path.name}")
+            depth = content[DEPTH]
     except InputError:
         raise
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(f"{file}: no readable depth ({error}); expected what make_scene writes") from None
-    shape = image_size(path)[::-1]
+    except Exception as error:  # of damaged archives Python, zlib and NumPy raise many kinds
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(f"{file}: no readable depth ({reason}); expected what make_scene writes") from None
+    if depth.dtype.kind not in "fiu":
+        raise InputError(f"{file}: depth of type {depth.dtype}, expected numbers")
     if depth.shape != shape:
         raise InputError(f"{file}: depth of shape {depth.shape}, expected {shape}, the size of {path.name}")
     crop = cover(shape[1], shape[0], width, height)

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..runtime.errors import InputError, exit_on_input_error
-from ..runtime.files import make_folder
 from ..runtime.outputs import Overwrite, guards_outputs, outputs
 from ..runtime.terminal import run, say
 from .curriculum import Objective, Part, Phase, Precision, curriculum, phase_at, rate_at
@@ -132,9 +131,9 @@ def train(
         raise InputError(f"--processes {processes}: more than the {batch} scenes of a step; raise --batch")
     from .parallel import Team, other_processes
 
-    folder = make_folder(out)
-    training = Run(folder, settings, config, features, Team(0, processes), threads)
-    with other_processes(processes, _work, folder, settings, config, features, threads, validate_every):
+    outputs().make_folder(out)
+    training = Run(out, settings, config, features, Team(0, processes), threads)
+    with other_processes(processes, _work, out, settings, config, features, threads, validate_every):
         training.go(save_every * 60, validate_every)
 
 

@@ -9,7 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ..runtime.files import replacing
+from ..runtime.errors import refuse
+from ..runtime.files import read_bytes, replacing
 
 CURVES_SIZE = (360, 900)  # pixels, of one curve
 MARGIN = 60
@@ -44,14 +45,33 @@ class TrainingLog:
 
 
 def _read(path: Path) -> list[dict[str, Any]]:
-    """The lines of a log; the last may be half written by a run that was killed, and is left out then."""
+    """The lines of a log; the last may be half written by a run that was killed, and is left out then.
+
+    Raises InputError for any other line that this module does not write: rewriting the log would lose it.
+    """
+    if not path.exists() or (path.is_file() and not path.stat().st_size):
+        return []
+    lines = read_bytes(path, "the log of a training run").decode(errors="replace").split("\n")
     entries = []
-    for line in path.read_text().splitlines() if path.exists() else []:
-        try:
-            entries.append(json.loads(line))
-        except json.JSONDecodeError:
-            break
+    for number, line in enumerate(lines, start=1):
+        entry = _entry(line)
+        if entry is not None:
+            entries.append(entry)
+        elif number < len(lines):  # every line that was written whole has an end, and something behind it
+            refuse(path, f"line {number} is none of a training log", "move the file away, or choose another --out")
     return entries
+
+
+def _entry(line: str) -> dict[str, Any] | None:
+    """What a line of a log says; None if it is no line of a log."""
+    try:
+        entry = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(entry, dict) or type(entry.get("step")) is not int:
+        return None
+    numbers = (value for value in entry.values() if value is not None)
+    return entry if all(type(value) is int or isinstance(value, float) for value in numbers) else None
 
 
 def _curve(name: str, points: np.ndarray) -> np.ndarray:
