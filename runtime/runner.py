@@ -67,9 +67,12 @@ class Runner:
             (stage, open_session(folder / stage.file, provider, _profiled(tuning, stage))) for stage in stages
         ]
         self.load_seconds = time.perf_counter() - started
-        properties = self._stages[0][1].get_modelmeta().custom_metadata_map
-        self.description: Description = read_description(properties, self.path)
-        self._check_graphs(folder)
+        try:
+            properties = self._stages[0][1].get_modelmeta().custom_metadata_map
+            self.description: Description = read_description(properties, self.path)
+            self._check_graphs(folder)
+        except UnicodeDecodeError:
+            raise InputError(f"{self.path}: damaged: its metadata or names are not UTF-8; export it again") from None
         self._keep = _last_uses([stage for stage, _ in self._stages])
 
     def predict(

@@ -10,9 +10,11 @@ from .user_cache import cache_folder
 # this when it is first imported; its function `disable_telemetry_events` comes too late.
 os.environ["ORT_DISABLE_TELEMETRY"] = "1"
 
-# numba would keep what it compiles beside our modules, or in a folder of its own in the user's cache.
+# numba would keep what it compiles beside our modules, or in a folder of its own in the user's cache, and PyTorch makes
+# a folder in the system's temporary folder, even if it compiles nothing.
 with suppress(RuntimeError):
     os.environ.setdefault("NUMBA_CACHE_DIR", str(cache_folder("numba")))
+    os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(cache_folder("torch")))
 
 # `python -m` lets modules be imported from the current folder, which may hold anybody's files. Python itself has looked
 # there by now: only `python -P -m` keeps it from that.

@@ -10,11 +10,11 @@ somebody else's: the error is always on the side of keeping a file.
 import hashlib
 import json
 import os
-import tempfile
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
+from .files import scratch_folder
 from .user_cache import cache_folder
 
 KEY_LENGTH = 32  # hexadecimal digits
@@ -89,10 +89,10 @@ def _rewrite(folder: Path, entries: dict[str, WrittenFile]) -> None:
     """Replace a record by one without the lines that newer ones made void."""
     with suppress(OSError, RuntimeError):
         record = _record_path(folder)
-        handle, name = tempfile.mkstemp(dir=record.parent)
-        with os.fdopen(handle, "w", encoding="ascii") as file:
-            file.writelines(_line(*item) for item in entries.items())
-        Path(name).replace(record)
+        with scratch_folder(record.parent) as scratch:
+            new = scratch / record.name
+            new.write_text("".join(_line(*item) for item in entries.items()), encoding="ascii")
+            new.replace(record)
 
 
 def _forget_oldest(records: Path) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 # Compiled code is kept between test runs, but not in the user's cache.
 os.environ["NUMBA_CACHE_DIR"] = str(Path(__file__).parent.parent / ".pytest_cache" / "numba")
+os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(Path(__file__).parent.parent / ".pytest_cache" / "torch")
 
 import idesplat.runtime  # noqa: F401  # first: it switches ONNX Runtime's telemetry off
 import pytest

@@ -50,7 +50,7 @@ MODEL = "--model model.onnx --near 1 --far 10"
 PHOTOGRAPHS = "--images images --cameras transforms.json"
 COMMANDS = {
     "infer": Command(
-        infer.infer, infer.main, f"{PHOTOGRAPHS} {MODEL} --size 32x48 --out out/a.ply", (*POSED, "model.onnx"), 40
+        infer.infer, infer.main, f"{PHOTOGRAPHS} {MODEL} --size 32x48 --out out/a.ply", (*POSED, "model.onnx"), 20
     ),
     "infer all": Command(
         infer.infer,
@@ -58,21 +58,21 @@ COMMANDS = {
         f"{PHOTOGRAPHS} {MODEL} --size 32x48 --views 2 --offset auto --out out/a.spz --save-depth out/depth "
         "--json out/a.json --report out/a.html --save-cameras out/c.json",
         (*POSED, "model.onnx"),
-        15,
+        6,
     ),
     "render": Command(
         render.render,
         render.main,
         "scene.ply --cameras transforms.json --out out --size 16x24 --background 1,0,1",
         ("scene.ply", "transforms.json"),
-        40,
+        30,
     ),
     "orbit": Command(
         render.render,
         render.main,
         "scene.ply --orbit --frames 2 --out out --size 16x24 --depth --degrees 20",
         ("scene.ply",),
-        20,
+        15,
     ),
     "convert": Command(convert.convert, convert.main, "scene.ply out/a.splat --min-opacity 0.1", ("scene.ply",), 40),
     "cameras": Command(
@@ -80,15 +80,15 @@ COMMANDS = {
         convert_cameras.main,
         "convert transforms.json out/c.json --images images",
         POSED,
-        40,
+        30,
     ),
-    "view": Command(view.view, view.main, f"scene.ply {PHOTOGRAPHS} --html out/a.html", ("scene.ply", *POSED), 30),
+    "view": Command(view.view, view.main, f"scene.ply {PHOTOGRAPHS} --html out/a.html", ("scene.ply", *POSED), 15),
     "export": Command(
         export.export,
         export.main,
         "last.ckpt out/a.onnx --views 2 --size 64x96 --preset idesplat-tiny",
         ("last.ckpt",),
-        30,
+        20,
     ),
     "eval scene": Command(
         evaluate.scene,
@@ -96,7 +96,7 @@ COMMANDS = {
         f"scene images --cameras transforms.json --out out {MODEL} --size 32x48 --context 000 --context 001 "
         "--target 002 --depth depth",
         (*POSED, "model.onnx", "depth/000.npz"),
-        20,
+        15,
     ),
     "eval chunks": Command(
         evaluate.chunks,
@@ -117,21 +117,21 @@ COMMANDS = {
         evaluate.main,
         "captures --checkouts checkouts --out out --views 2 --size 32x48 --model model.onnx",
         ("model.onnx",),
-        15,
+        10,
     ),
     "bench": Command(
         bench.bench,
         bench.main,
         "missing.onnx --views 2 --sizes 32x48 --repeats 1 --threads 1 --no-eager --json out/b.json --compare rows.json",
         ("rows.json",),
-        15,
+        8,
     ),
     "train": Command(
         train.train,
         train.main,
         f"--out out --preset {SMALL_PRESET} --objective photometric --steps 1 --batch 1 --size 64 --data .",
         POSED,
-        15,
+        8,
     ),
 }
 

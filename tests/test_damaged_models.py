@@ -99,6 +99,15 @@ def test_damaged_metadata(name: str) -> None:
     one_line(error)
 
 
+@pytest.mark.parametrize("name", ["preset", "depth"])
+def test_names_of_a_graph_that_are_not_utf8(tmp_path: Path, name: str) -> None:
+    path = write_model(tmp_path / "model.onnx")
+    path.write_bytes(path.read_bytes().replace(name.encode(), b"\xff" + name[1:].encode()))
+    with pytest.raises(InputError, match=r"model\.onnx: ") as error:
+        Runner(path)
+    one_line(error)
+
+
 # ---- manifests
 
 STAGES = [

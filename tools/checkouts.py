@@ -2,12 +2,11 @@
 
 import os
 import subprocess
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 from ..runtime.errors import InputError
-from ..runtime.files import make_folder
+from ..runtime.files import make_folder, scratch_folder
 
 CLONES = "captures"  # in our own cache folder
 HOST = "https://github.com"
@@ -41,8 +40,8 @@ def fetch_checkout(folder: Path, repository: str, commit: str, host: str = HOST)
         return found
     target = folder / repository.replace("/", "+")
     # A fetch that fails or is killed must not leave what looks like a checkout.
-    with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=make_folder(folder)) as name:
-        fetched = make_folder(Path(name) / target.name)
+    with scratch_folder(make_folder(folder)) as scratch:
+        fetched = make_folder(scratch / target.name)
         _git(fetched, "init", "--quiet", "--bare")
         _git(fetched, "remote", "add", "origin", f"{host}/{repository}")
         _git(fetched, "fetch", "--quiet", "--depth=1", "--filter=blob:none", "origin", commit)
