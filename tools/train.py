@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -57,6 +58,7 @@ class Settings:
     scenes: int = 0
     real_ratio: float = 1.0
     precision: str = "float32"
+    textures: str = ""
 
 
 @exit_on_input_error
@@ -66,6 +68,9 @@ def train(
     init: Annotated[Path | None, typer.Option(help="Checkpoint to start from, released or own.")] = None,
     data: Annotated[
         list[Path] | None, typer.Option(help="Folder with photographs and transforms.json, instead of drawn scenes.")
+    ] = None,
+    textures: Annotated[
+        Path | None, typer.Option(help="Folder of images for the textures of synthetic scenes, beside generated ones.")
     ] = None,
     real_ratio: Annotated[
         float, typer.Option(help="Share of the scenes taken from --data; the others are synthetic.", min=0, max=1)
@@ -118,6 +123,7 @@ def train(
         scenes if head else 0,
         real_ratio,
         precision.value,
+        str(textures.resolve()) if textures else "",
     )
     config = _config(settings)
     if processes > batch:
@@ -298,16 +304,21 @@ def _config(settings: Settings) -> "IDESplatConfig":
 
 def _source(settings: Settings, config: "IDESplatConfig") -> "Callable[[Order], Views]":
     """What makes the scenes' views: synthetic scenes, the given folders, or both."""
+    from .photo_textures import photo_textures
     from .training_data import draw_views
 
+    photos = Path(settings.textures) if settings.textures else None
+    if photos is not None:
+        photo_textures(photos)
+    synthetic = partial(draw_views, photos=photos)
     if not settings.data:
-        return draw_views
+        return synthetic
     from .training_folders import FolderScenes
 
     captures = FolderScenes([Path(folder) for folder in settings.data], config.near, config.far)
     if settings.real_ratio == 1:
         return captures.draw
-    return lambda order: captures.draw(order) if order.real else draw_views(order)
+    return lambda order: captures.draw(order) if order.real else synthetic(order)
 
 
 def _trained(settings: Settings) -> tuple[str, ...]:
@@ -328,7 +339,9 @@ def _task(
 
     size, batch = settings.size, settings.batch
     if settings.part == Part.HEAD:
-        cache = FeatureCache(features, model, source, repr((size, settings.data, HeadInputs._fields)))
+        cache = FeatureCache(
+            features, model, source, repr((size, settings.data, settings.textures, HeadInputs._fields))
+        )
         return HeadTask(cache, settings.seed, size, batch, settings.scenes, settings.real_ratio, load_perceptual())
     objective = Objective(settings.objective)
     phases = curriculum(objective, settings.gradual)
