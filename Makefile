@@ -45,7 +45,7 @@ weights: setup runs/textures
 	$(BIN)/idesplat-train --out runs/head --train head --init runs/lite/last.ckpt --preset idesplat-lite \
 		--textures runs/textures --scenes 2000 --steps 5000 --batch 2 --processes 2 --precision bf16 --lr 3e-4 \
 		--size 256 --seed 1
-	$(BIN)/python -m idesplat.tools.carry runs/head/last.ckpt
+	$(BIN)/python -m idesplat.tools.carry runs/head/last.ckpt --preset idesplat-lite
 
 clean:
 	rm -rf $(VENV) build .typing *.egg-info
