@@ -18,11 +18,12 @@ import typer
 
 from ..runtime.errors import InputError, exit_on_input_error
 from ..runtime.files import make_folder
-from .curriculum import Objective, Part, Phase, Precision, curriculum, phase_at, rate_at
+from .curriculum import Objective, Part, PerceptualKind, Phase, Precision, curriculum, phase_at, rate_at
 
 if TYPE_CHECKING:  # torch and compiled code are loaded only once there is something to train
     from ..model.config import IDESplatConfig
     from ..model.idesplat import IDESplat
+    from .losses import Perceptual
     from .parallel import Team
     from .training_data import Order, Views
     from .training_log import TrainingLog
@@ -59,6 +60,7 @@ class Settings:
     real_ratio: float = 1.0
     precision: str = "float32"
     textures: str = ""
+    perceptual: str = "lpips"
 
 
 @exit_on_input_error
@@ -94,6 +96,10 @@ def train(
     lr: Annotated[float, typer.Option(help="Highest learning rate.", min=0)] = 1e-3,
     vit_lr: Annotated[float, typer.Option(help="Highest learning rate of the ViT.", min=0)] = 5e-4,
     seed: Annotated[int, typer.Option(help="Of the weights and the scenes.", min=0)] = 0,
+    perceptual: Annotated[
+        PerceptualKind,
+        typer.Option(help="Of rendered views: LPIPS where it is, EfficientNet-Lite0's features, or none."),
+    ] = PerceptualKind.LPIPS,
     precision: Annotated[
         Precision, typer.Option(help="Of convolutions and attention; bfloat16 is quicker where the CPU has it.")
     ] = Precision.FLOAT32,
@@ -124,6 +130,7 @@ def train(
         real_ratio,
         precision.value,
         str(textures.resolve()) if textures else "",
+        perceptual.value,
     )
     config = _config(settings)
     if processes > batch:
@@ -334,7 +341,6 @@ def _task(
     """What the settings ask for; features: the folder of cached features."""
     from ..model.gaussian_head import HeadInputs
     from .head_training import FeatureCache
-    from .losses import load_perceptual
     from .training_tasks import HeadTask, WholeTask
 
     size, batch = settings.size, settings.batch
@@ -342,11 +348,21 @@ def _task(
         cache = FeatureCache(
             features, model, source, repr((size, settings.data, settings.textures, HeadInputs._fields))
         )
-        return HeadTask(cache, settings.seed, size, batch, settings.scenes, settings.real_ratio, load_perceptual())
+        return HeadTask(cache, settings.seed, size, batch, settings.scenes, settings.real_ratio, _perceptual(settings))
     objective = Objective(settings.objective)
     phases = curriculum(objective, settings.gradual)
-    perceptual = load_perceptual() if any(phase.gaussians for phase in phases) else None
+    perceptual = _perceptual(settings) if any(phase.gaussians for phase in phases) else None
     return WholeTask(phases, objective, settings.seed, size, source, settings.real_ratio, perceptual)
+
+
+def _perceptual(settings: Settings) -> "Perceptual | None":
+    """The perceptual distance that the settings ask for, where it can be had."""
+    from .losses import load_perceptual
+    from .perceptual import PhotographicDistance
+
+    if settings.perceptual == PerceptualKind.LITE0:
+        return PhotographicDistance()
+    return load_perceptual() if settings.perceptual == PerceptualKind.LPIPS else None
 
 
 def _prepare_process(threads: int) -> None:
