@@ -28,12 +28,25 @@ check: setup
 demo: setup
 	$(BIN)/python -P -m idesplat.tools.demo demo
 
-# The carried model, trained from nothing: five hours of one core. Stopped at any moment, it goes on where it was.
-weights: setup
-	$(BIN)/idesplat-train --out runs/tiny --steps 4000 --batch 1 --size 256 --seed 0
-	$(BIN)/idesplat-train --out runs/finer --init runs/tiny/last.ckpt --no-gradual \
-		--steps 1200 --lr 5e-4 --vit-lr 2e-4 --batch 1 --size 256 --seed 1
-	$(BIN)/python -P -m idesplat.tools.carry runs/finer/last.ckpt
+# Photographs under free licences (MODEL_CARD.md) for the textures of training scenes; it needs Debian's apt and git.
+TEXTURES := gnome-backgrounds mate-backgrounds plasma-workspace-wallpapers
+runs/textures:
+	mkdir -p runs/textures.part
+	cd runs/textures.part && apt-get download $(TEXTURES) && for package in *.deb; do dpkg-deb -x $$package .; done
+	git clone --quiet --depth 1 https://github.com/pmndrs/drei-assets runs/drei-assets
+	cp -r runs/drei-assets/hdri runs/textures.part/
+	find runs/textures.part \( -type l -o -size -60k -o -name '*.deb' \) ! -type d -delete
+	mv runs/textures.part runs/textures
+
+# The successor of the carried model, trained from nothing: some ten hours of two cores. Each command resumes where it was
+# stopped. How the carried weights were made: MODEL_CARD.md.
+weights: setup runs/textures
+	$(BIN)/idesplat-train --out runs/lite --preset idesplat-lite --textures runs/textures --steps 24000 --batch 2 \
+		--processes 2 --precision bf16 --size 256 --seed 0
+	$(BIN)/idesplat-train --out runs/head --train head --init runs/lite/last.ckpt --preset idesplat-lite \
+		--textures runs/textures --scenes 2000 --steps 5000 --batch 2 --processes 2 --precision bf16 --lr 3e-4 \
+		--size 256 --seed 1
+	$(BIN)/python -P -m idesplat.tools.carry runs/head/last.ckpt --preset idesplat-lite
 
 clean:
 	rm -rf $(VENV) build .typing *.egg-info

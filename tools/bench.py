@@ -32,6 +32,7 @@ if TYPE_CHECKING:  # nothing heavy is loaded before there is something to measur
 WORSE = 1  # exit status where --compare finds something that became worse
 INTERRUPTED = 130
 FEWEST_VIEWS = 2
+STEPS_OF_A_ROUND = 3  # of training
 EAGER = "PyTorch"
 # Threads that have done their work keep spinning for a while; nobody should run beside them.
 SETTLE_SECONDS = 0.25
@@ -72,6 +73,9 @@ def bench(
     repeats: Annotated[int, typer.Option(help="Rounds.", min=1)] = 7,
     threads: Annotated[int | None, typer.Option(help="Threads of each, instead of one a core.", min=1)] = None,
     eager: Annotated[bool, typer.Option(help="Run the same networks in PyTorch, where it is installed.")] = True,
+    training: Annotated[
+        bool, typer.Option("--training", help="Measure training instead: scenes a second, as it was and as it is.")
+    ] = False,
     json_path: Annotated[
         Path | None, typer.Option("--json", help="Write everything as JSON, to standard output if it is -.")
     ] = None,
@@ -81,6 +85,11 @@ def bench(
     overwrite: Overwrite = False,
 ) -> None:
     """Measure time and memory of exported models side by side, each in a fresh process. Ctrl-C keeps what is done."""
+    if training:
+        from .bench_training import bench_training
+
+        bench_training(repeats, STEPS_OF_A_ROUND)
+        return
     from .bench_report import compare as compare_rows
     from .bench_report import print_rows, read_rows, write_rows
 

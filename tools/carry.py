@@ -23,10 +23,11 @@ PRESET = "idesplat-tiny"
 @exit_on_input_error
 def carry(
     checkpoint: Annotated[Path, typer.Argument(help="What idesplat-train wrote.", show_default=False)],
+    preset: Annotated[str, typer.Option(help="The network.")] = PRESET,
 ) -> None:
     """Export a checkpoint as the carried model."""
     path = make_folder(FOLDER) / NAME
-    export(checkpoint, path, preset=PRESET)
+    export(checkpoint, path, preset=preset)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     with replacing(path.with_name(NAME + CHECKSUM_SUFFIX)) as temporary:
         temporary.write_text(f"{digest}  {NAME}\n")

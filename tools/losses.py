@@ -1,20 +1,17 @@
 """What training asks of each stage: inverse depth, its gradients and probabilities, and rendered novel views."""
 
-import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from ..model.config import IDESplatConfig
 from ..model.dpbu import Boosted
 from ..model.encoder import Encoded
-from ..model.gaussian_adapter import BASE_PARAMETERS, BASE_SIZES, SCALE_SHIFT, SH_C0
+from ..model.gaussian_adapter import BASE_SIZES
 from ..model.layers import repeat_views
-from .baselines import SPLAT_PIXELS
 
 # Shares of the terms of one stage's loss.
 FIRST_LAYER_SHARE = 0.5
@@ -29,14 +26,9 @@ LARGE_RELATIVE = 0.5
 LARGE_BINS = 8.0
 # The same for the mean squared error of an image: 25 dB.
 LARGE_SQUARED = 0.003
-# The head of a new network is held to a rule: a splat in the middle of its pixel, of its colour, opaque, and
-# `SPLAT_PIXELS` large. Drawn views alone settle that slowly, and teach what does not carry over: to answer wrong depth
-# with splats half transparent, so that black shows through everywhere; to shift splats downwards, because floors come
-# nearer downwards and the nearer of two neighbours hides the other.
-SIZE_SHARE = 0.03
-OPACITY_SHARE = 0.1
+# The one prior on Gaussians: that they lie in the middle of their pixels. Synthetic views alone teach a head to shift
+# all of them downwards, because floors come nearer downwards and the nearer of two neighbours hides the other.
 OFFSET_SHARE = 0.05
-COLOUR_SHARE = 0.1
 # The share of LPIPS beside the squared error (the papers' lambda).
 LPIPS_SHARE = 0.05
 # The file that torchvision keeps VGG16's weights in, on which LPIPS rests.
@@ -127,33 +119,22 @@ def monocular_loss(encoded: Encoded, inverse_depth: Tensor) -> Tensor:
     return MONOCULAR_SHARE * softened(error, 1.0).mean()
 
 
-def photometric_loss(rendered: Tensor, truth: Tensor, perceptual: Perceptual | None) -> Tensor:
-    """Squared error, plus LPIPS where there is one; images [views, 3, H, W] in [0, 1]."""
-    loss = F.mse_loss(rendered, truth)
-    return loss if perceptual is None else loss + LPIPS_SHARE * perceptual(rendered, truth)
-
-
 def render_loss(rendered: Tensor, truth: Tensor, perceptual: Perceptual | None) -> Tensor:
-    """`photometric_loss` image by image, each softened: what no input view shows does not rule over the rest."""
+    """Squared error and, where there is one, the perceptual distance; images [views, 3, H, W] in [0, 1].
+
+    The error of each image is softened: what no input view shows does not rule over the rest.
+    """
     squared = (rendered - truth).square().mean((1, 2, 3))
     loss = softened(squared, LARGE_SQUARED).mean()
     return loss if perceptual is None else loss + LPIPS_SHARE * perceptual(rendered, truth)
 
 
 def offset_loss(raw: Tensor) -> Tensor:
-    """How far Gaussians are from the middle of their pixels; raw as for `splat_loss`."""
-    return OFFSET_SHARE * (raw[:, BASE_OFFSETS].sigmoid() - 0.5).abs().mean()
-
-
-def splat_loss(raw: Tensor) -> Tensor:
-    """How far a network's splats are from those of the rule, where it predicts their scales in pixels.
+    """How far Gaussians are from the middle of their pixels.
 
     raw: what GaussianAdapter is given, [views, parameters, H, W].
     """
-    opacity, _, scales, _, sh = raw.split((*BASE_SIZES, raw.shape[1] - BASE_PARAMETERS), dim=1)
-    size = (F.softplus(scales - SCALE_SHIFT).log() - math.log(SPLAT_PIXELS)).abs().mean()
-    colour = SH_C0 * sh[:, :: sh.shape[1] // 3].abs().mean()  # of each channel the band 0
-    return SIZE_SHARE * size + offset_loss(raw) + COLOUR_SHARE * colour - OPACITY_SHARE * F.logsigmoid(opacity).mean()
+    return OFFSET_SHARE * (raw[:, BASE_OFFSETS].sigmoid() - 0.5).abs().mean()
 
 
 def load_perceptual() -> Perceptual | None:

@@ -21,6 +21,9 @@ ANY_KINDS = (
     *("glyphs", "gradient", "cells", "weave", "strokes", "collage"),
 )
 
+# Textures that are windows of photographs, and the share of the materials that have one, where there are any.
+PHOTO_KIND, PHOTO_SHARE = "photo", 0.5
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -42,11 +45,14 @@ class Builder:
     solids: list[tuple[int, np.ndarray, np.ndarray, np.ndarray, tuple[int, ...]]] = field(default_factory=list)
     materials: list[tuple[int, np.ndarray, np.ndarray, float, float]] = field(default_factory=list)
 
+    def __post_init__(self) -> None:
+        self.photos = self.bank.of_kind(PHOTO_KIND)
+
     def material(self, *kinds: str, period: float | None = None, glow: float = 0.0) -> int:
         """Add a material with a texture of one of `kinds`, recoloured; `period`: its size in metres."""
         rng = self.rng
         kind = kinds[rng.integers(len(kinds))]
-        choices = self.bank.of_kind(kind)
+        choices = self.photos if self.photos and rng.random() < PHOTO_SHARE else self.bank.of_kind(kind)
         texture = choices[rng.integers(len(choices))]
         frequency = 1 / (period or np.exp(rng.uniform(np.log(0.3), np.log(2.0))))
         turn = rng.integers(4) * np.pi / 2 if rng.random() < 0.85 else rng.uniform(0, 2 * np.pi)
@@ -109,9 +115,29 @@ class Builder:
         )
 
 
-def draw_layout(rng: np.random.Generator, bank: Textures) -> Layout:
-    """A scene of a random kind."""
-    return LAYOUTS[rng.integers(len(LAYOUTS))](rng, bank)
+def draw_layout(rng: np.random.Generator, bank: Textures, outdoors: bool = False) -> Layout:
+    """A scene of a random kind; outdoors: with those kinds that are seen from outside, from above or all around."""
+    layouts = LAYOUTS + OUTDOOR_LAYOUTS if outdoors else LAYOUTS
+    return layouts[rng.integers(len(layouts))](rng, bank)
+
+
+def _open_ground(build: Builder, *ground_kinds: str) -> float:
+    """Add ground and sky; returns how far the sky is."""
+    rng = build.rng
+    reach = rng.uniform(18, 45)
+    sky = build.material("gradient", "noise", "plain", period=reach * rng.uniform(0.7, 2.0), glow=0.25)
+    ground = build.material(*ground_kinds, period=rng.uniform(1.5, 5.0))
+    build.add(BOX, (0, -reach / 2, 0), (reach, reach / 2, reach), (sky, sky, sky, ground, sky, sky))
+    return float(reach)
+
+
+def _sunlight(build: Builder) -> Scene:
+    """The scene lit by the sun, in a part of the scenes with shadows, and by the sky."""
+    rng = build.rng
+    sun = rng.normal(0, 1, 3) * (1, 0.3, 1) - (0, 1.2, 0)
+    half_length = 6.0 if rng.random() < 0.4 else -1.0
+    lights = [(200 * sun / np.linalg.norm(sun), rng.uniform(0.5, 0.8) * _tone(rng), 1e9, half_length)]
+    return build.scene(lights, rng.uniform(0.35, 0.55) * _tone(rng))
 
 
 def furnished_room(rng: np.random.Generator, bank: Textures) -> Layout:
@@ -154,10 +180,7 @@ def _clutter(rng: np.random.Generator, bank: Textures) -> Layout:
 def _street(rng: np.random.Generator, bank: Textures) -> Layout:
     """Open ground with buildings, trees, poles and boxes under a far sky."""
     build = Builder(rng, bank)
-    reach = rng.uniform(18, 45)
-    sky = build.material("gradient", "noise", "plain", period=reach * rng.uniform(0.7, 2.0), glow=0.25)
-    ground = build.material(*GROUND_KINDS, period=rng.uniform(1.5, 5.0))
-    build.add(BOX, (0, -reach / 2, 0), (reach, reach / 2, reach), (sky, sky, sky, ground, sky, sky))
+    reach = _open_ground(build, *GROUND_KINDS)
     for _ in range(rng.integers(2, 7)):
         half_x, half_y, half_z = rng.uniform(1, 4), rng.uniform(1.2, 6), rng.uniform(1, 4)
         bearing, distance = rng.uniform(0, 2 * np.pi), rng.uniform(6, 0.8 * reach)
@@ -172,12 +195,8 @@ def _street(rng: np.random.Generator, bank: Textures) -> Layout:
         build.place, build.yaw = (distance * np.cos(bearing), 0, distance * np.sin(bearing)), rng.uniform(0, 7)
         (_tree, _pole, _crates, _crates, _fence)[rng.integers(5)](build)
     build.place, build.yaw = (0.0, 0.0, 0.0), 0.0
-    sun = rng.normal(0, 1, 3) * (1, 0.3, 1) - (0, 1.2, 0)
-    half_length = 6.0 if rng.random() < 0.4 else -1.0
-    lights = [(200 * sun / np.linalg.norm(sun), rng.uniform(0.5, 0.8) * _tone(rng), 1e9, half_length)]
-    scene = build.scene(lights, rng.uniform(0.35, 0.55) * _tone(rng))
     eyes = np.array([[-8, -2.5, -8], [8, -1.0, 8]])
-    return Layout(scene, eyes, np.array([[-4, -2.0, -4], [4, -0.3, 4]]))
+    return Layout(_sunlight(build), eyes, np.array([[-4, -2.0, -4], [4, -0.3, 4]]))
 
 
 def _table_top(rng: np.random.Generator, bank: Textures) -> Layout:
@@ -219,6 +238,114 @@ def _cards(rng: np.random.Generator, bank: Textures) -> Layout:
     return Layout(_indoor_light(build, width, height, length), eyes, focus)
 
 
+def _facade(rng: np.random.Generator, bank: Textures) -> Layout:
+    """The front of a building with windows in recesses, ledges, columns and doors, and what stands before it."""
+    build = Builder(rng, bank)
+    _open_ground(build, *GROUND_KINDS)
+    wall = build.material("brick", "cells", "plain", "noise", "wood", period=rng.uniform(0.8, 3.0))
+    trim, pane = build.material("plain", "noise", "speckle"), build.material("plain", "gradient", "collage")
+    half_x, height, depth = rng.uniform(4, 9), rng.uniform(3, 9), rng.uniform(0.05, 0.4)
+    build.box(0, -height / 2, 1.0, half_x, height / 2, 1.0, pane)
+    columns, storeys = int(rng.integers(3, 8)), max(1, round(height / rng.uniform(2.2, 3.2)))
+    pitch, storey = 2 * half_x / columns, height / storeys
+    pier, band = rng.uniform(0.15, 0.35) * pitch, rng.uniform(0.15, 0.3) * storey
+    for column in range(columns + 1):
+        build.box(-half_x + column * pitch, -height / 2, -depth / 2, pier, height / 2, depth / 2, wall)
+    for level in range(storeys + 1):
+        build.box(0, -level * storey, -depth / 2, half_x, band, depth / 2 + 0.03, wall)
+        build.box(0, -level * storey - band, -depth / 2, half_x, 0.06, depth / 2 + rng.uniform(0.03, 0.2), trim)
+    for _ in range(rng.integers(2, 9)):
+        build.place, build.yaw = (rng.uniform(-0.9, 0.9) * half_x, 0.0, -rng.uniform(0.6, 4.0)), rng.uniform(0, 7)
+        (_plant, _pole, _crates, _fence, _tree)[rng.integers(5)](build)
+    build.place, build.yaw = (0.0, 0.0, 0.0), 0.0
+    eyes = np.array([[-0.6 * half_x, -2.2, -9.0], [0.6 * half_x, -1.2, -3.5]])
+    focus = np.array([[-0.5 * half_x, -0.6 * height, 0.0], [0.5 * half_x, -0.8, 0.0]])
+    return Layout(_sunlight(build), eyes, focus)
+
+
+def _around_object(rng: np.random.Generator, bank: Textures) -> Layout:
+    """One object of many solids that run into each other, on the ground or on a stand, seen from close by."""
+    build = Builder(rng, bank)
+    outside = rng.random() < 0.5
+    size = _room(build) if not outside else None
+    if outside:
+        _open_ground(build, *GROUND_KINDS)
+    top = rng.choice([0.0, rng.uniform(0.3, 0.9)])
+    if top:
+        stand = build.material(*FURNITURE_KINDS)
+        build.add(CYLINDER, (0, -top / 2, 0), (rng.uniform(0.25, 0.6), top / 2, rng.uniform(0.25, 0.6)), stand)
+    scale = rng.uniform(0.12, 0.4)
+    materials = [build.material(*ANY_KINDS, period=scale * rng.uniform(0.5, 3.0)) for _ in range(rng.integers(1, 5))]
+    for _ in range(rng.integers(5, 24)):
+        half = scale * np.exp(rng.normal(-0.9, 0.5, 3))
+        centre = tuple(rng.normal(0, 0.5, 3) * scale - (0, top + scale, 0))
+        shape = int(rng.choice([BOX, ELLIPSOID, ELLIPSOID, CYLINDER]))
+        build.add(shape, centre, tuple(half), materials[rng.integers(len(materials))], _rotation(rng))
+    for _ in range(rng.integers(0, 5)):
+        bearing, distance = rng.uniform(0, 2 * np.pi), rng.uniform(1.2, 2.5)
+        build.place, build.yaw = (distance * np.cos(bearing), 0, distance * np.sin(bearing)), rng.uniform(0, 7)
+        (_plant, _crates, _chair)[rng.integers(3)](build)
+    build.place, build.yaw = (0.0, 0.0, 0.0), 0.0
+    bearing, distance = rng.uniform(0, 2 * np.pi), scale * rng.uniform(2.5, 5.0)
+    eye = np.array([distance * np.cos(bearing), -top - scale * rng.uniform(0.5, 3.0), distance * np.sin(bearing)])
+    focus = np.array([0.0, -top - scale, 0.0])
+    spread = 0.3 * scale
+    scene = _sunlight(build) if size is None else _indoor_light(build, *size)
+    return Layout(scene, np.stack([eye - spread, eye + spread]), np.stack([focus - spread, focus + spread]))
+
+
+def _from_above(rng: np.random.Generator, bank: Textures) -> Layout:
+    """Houses, trees and roads, from a drone."""
+    build = Builder(rng, bank)
+    _open_ground(build, *GROUND_KINDS)
+    for _ in range(rng.integers(1, 4)):
+        build.yaw = rng.uniform(0, np.pi)
+        road = build.material("plain", "noise", "speckle", period=3.0)
+        build.box(rng.uniform(-6, 6), -0.01, 0, rng.uniform(0.8, 2.0), 0.02, 17, road)
+    for _ in range(rng.integers(6, 22)):
+        build.place, build.yaw = (rng.uniform(-12, 12), 0.0, rng.uniform(-12, 12)), rng.uniform(0, 7)
+        half_x, half_y, half_z = rng.uniform(0.8, 2.5), rng.uniform(0.6, 2.5), rng.uniform(0.8, 2.5)
+        wall, roof = build.material(*WALL_KINDS, period=2.0), build.material("brick", "stripes", "cells", period=1.5)
+        build.box(0, -half_y, 0, half_x, half_y, half_z, wall)
+        slope = rng.uniform(0.2, 0.7)
+        cos, sin = np.cos(slope), np.sin(slope)
+        for side in (-1, 1):
+            axes = np.array([[cos, side * sin, 0], [-side * sin, cos, 0], [0, 0, 1.0]])
+            centre = (side * 0.5 * half_x, -2 * half_y - 0.5 * half_x * np.tan(slope), 0)
+            build.add(BOX, centre, (0.55 * half_x / cos, 0.04, 1.1 * half_z), roof, axes)
+    for _ in range(rng.integers(4, 16)):
+        build.place, build.yaw = (rng.uniform(-12, 12), 0.0, rng.uniform(-12, 12)), 0.0
+        _tree(build)
+    build.place, build.yaw = (0.0, 0.0, 0.0), 0.0
+    eyes = np.array([[-10, -14.0, -10], [10, -7.0, 10]])
+    return Layout(_sunlight(build), eyes, np.array([[-4, -1.0, -4], [4, 0.0, 4]]))
+
+
+def _foliage(rng: np.random.Generator, bank: Textures) -> Layout:
+    """Bushes and branches: many thin leaves at many depths, before a wall or open ground."""
+    build = Builder(rng, bank)
+    _open_ground(build, "strokes", "noise", "cells")
+    if rng.random() < 0.5:
+        build.box(0, -1.5, 2.5, 5, 1.5, 0.1, build.material(*WALL_KINDS, period=2.0))
+    for _ in range(rng.integers(2, 5)):
+        leaf = build.material("strokes", "noise", "gradient", period=rng.uniform(0.1, 0.4))
+        wood = build.material("wood", "noise", period=0.3)
+        place, radius = (rng.uniform(-1.5, 1.5), 0.0, rng.uniform(-0.5, 2.0)), rng.uniform(0.3, 0.7)
+        build.place, length = place, rng.uniform(0.05, 0.16)
+        for _ in range(rng.integers(2, 6)):
+            half = rng.uniform(0.4, 0.8) * radius
+            tilt = _rotation(rng, 0.6)
+            build.add(CYLINDER, (rng.normal(0, 0.1), -half, rng.normal(0, 0.1)), (0.015, half, 0.015), wood, tilt)
+        for _ in range(rng.integers(15, 40)):
+            centre = tuple(rng.normal(0, 0.5, 3) * radius - (0, radius, 0))
+            blade = length * rng.uniform(0.3, 0.6), length, 0.04 * length
+            build.add(ELLIPSOID, centre, blade, leaf, _rotation(rng))
+    build.place = (0.0, 0.0, 0.0)
+    eyes = np.array([[-1.5, -1.7, -3.5], [1.5, -0.5, -1.8]])
+    return Layout(_sunlight(build), eyes, np.array([[-0.8, -0.9, 0.0], [0.8, -0.3, 1.0]]))
+
+
+OUTDOOR_LAYOUTS = (_facade, _around_object, _around_object, _from_above, _foliage)
 LAYOUTS: tuple[Callable[[np.random.Generator, Textures], Layout], ...] = (
     *(furnished_room, furnished_room, furnished_room),
     *(_clutter, _clutter, _street, _table_top, _cards),

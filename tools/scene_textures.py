@@ -32,11 +32,11 @@ def texture_bank(seed: int, count: int) -> Textures:
     """`count` textures, the kinds in turn, the same for the same seed. Takes some 10 ms and 256 KiB a texture."""
     names = list(PATTERNS)
     kinds = tuple(names[index % len(names)] for index in range(count))
-    texels = [_mip_levels(PATTERNS[kind](np.random.default_rng([seed, index]))) for index, kind in enumerate(kinds)]
+    texels = [mip_levels(PATTERNS[kind](np.random.default_rng([seed, index]))) for index, kind in enumerate(kinds)]
     return Textures(np.stack(texels), kinds)
 
 
-def _mip_levels(colours: np.ndarray) -> np.ndarray:
+def mip_levels(colours: np.ndarray) -> np.ndarray:
     """All levels of `colours` [SIZE, SIZE, 3], one after the other, uint8 [texels, 3]."""
     levels = [colours.clip(0, 1).astype(np.float32)]
     for _ in range(LEVELS - 1):

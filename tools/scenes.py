@@ -24,6 +24,20 @@ GOOD_OVERLAP = 0.6  # share of the first view's points that each other view shou
 
 
 @dataclass(frozen=True)
+class Spread:
+    """How far the views of a capture differ, as shares: exposure, white balance; and how many are JPEG files."""
+
+    exposure: float
+    white_balance: float
+    compressed: float
+
+
+# Of training scenes, and of those that results are reported on.
+CAPTURE_SPREAD, HELD_OUT_SPREAD = Spread(0.08, 0.03, 0.5), Spread(0.05, 0.0, 0.0)
+JPEG_QUALITY = (60, 98)
+
+
+@dataclass(frozen=True)
 class Sample:
     """Views of one scene: first the context views, which a network sees, then the target views, which it is to render.
 
@@ -52,17 +66,26 @@ def scene_textures(seed: int) -> Textures:
 
 
 def draw_sample(
-    seed: int, context: int, targets: int, height: int, width: int, samples: int = 4, closer: Sequence[int] = ()
+    seed: int,
+    context: int,
+    targets: int,
+    height: int,
+    width: int,
+    samples: int = 4,
+    closer: Sequence[int] = (),
+    bank: Textures | None = None,
 ) -> Sample:
     """The sample of `seed`: `context` views whose neighbours overlap, and `targets` views between and around them.
 
     The same arguments give the same sample. samples: rays for a pixel's colour. closer: how many times as large as the
     context each target is drawn, of which the picture is then a window somewhere; if empty, all are as large.
+    bank: textures instead of `scene_textures(seed)`.
     The first call in a process draws the textures (some seconds).
     """
     rng = np.random.default_rng(seed)
-    bank = scene_textures(seed)
-    layout = draw_layout(rng, bank)
+    training = seed in TRAINING_SEEDS
+    bank = bank or scene_textures(seed)
+    layout = draw_layout(rng, bank, outdoors=training)
     intrinsics = _draw_intrinsics(rng, context + targets, width / height)
     extrinsics = _draw_cameras(rng, layout, intrinsics, context, targets)
     for view, times in enumerate(closer, start=context):
@@ -77,7 +100,8 @@ def draw_sample(
     extrinsics[:, :3, 3] *= scale
     brightness = float(np.mean([image.mean() for image, _ in views]))
     exposure = np.float32(np.clip(rng.uniform(0.33, 0.52) / max(brightness, 1e-3), 0.6, 2.5))
-    images = [_develop(rng, image * exposure, worn=index < context) for index, (image, _) in enumerate(views)]
+    spread = CAPTURE_SPREAD if training else HELD_OUT_SPREAD
+    images = [_develop(rng, image * exposure, index < context, spread) for index, (image, _) in enumerate(views)]
     return Sample(
         np.stack(images).transpose(0, 3, 1, 2).copy(),
         depth * np.float32(scale),
@@ -224,12 +248,19 @@ def _draw_range(rng: np.random.Generator, depth: np.ndarray) -> tuple[float, flo
     return 1 / near, 1.0, far / near
 
 
-def _develop(rng: np.random.Generator, image: np.ndarray, worn: bool) -> np.ndarray:
+def _develop(rng: np.random.Generator, image: np.ndarray, worn: bool, spread: Spread) -> np.ndarray:
     """The image [height, width, 3] as a camera gives it: `worn` by its own exposure, blur and noise."""
     if worn:
-        image = image * np.float32(rng.uniform(0.95, 1.05))
+        image = image * np.float32(rng.uniform(1 - spread.exposure, 1 + spread.exposure))
+        if spread.white_balance:
+            image = image * rng.uniform(1 - spread.white_balance, 1 + spread.white_balance, 3).astype(np.float32)
         blur = rng.uniform(-0.5, 0.8)  # pixels
         if blur > 0.25:
             image = cv2.GaussianBlur(image, (5, 5), blur)
         image = image + np.float32(max(rng.uniform(-0.01, 0.02), 0)) * rng.standard_normal(image.shape, np.float32)
-    return image.clip(0, 1).astype(np.float32)
+    image = image.clip(0, 1).astype(np.float32)
+    if worn and spread.compressed and rng.random() < spread.compressed:
+        quality = int(rng.integers(*JPEG_QUALITY))
+        _, coded = cv2.imencode(".jpg", np.rint(255 * image).astype(np.uint8), (cv2.IMWRITE_JPEG_QUALITY, quality))
+        image = np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR), np.float32) / 255
+    return image

@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,11 +19,12 @@ import typer
 from ..runtime.errors import InputError, exit_on_input_error
 from ..runtime.outputs import Overwrite, guards_outputs, outputs
 from ..runtime.terminal import run, say
-from .curriculum import Objective, Part, Phase, Precision, curriculum, phase_at, rate_at
+from .curriculum import Objective, Part, PerceptualKind, Phase, Precision, curriculum, phase_at, rate_at
 
 if TYPE_CHECKING:  # torch and compiled code are loaded only once there is something to train
     from ..model.config import IDESplatConfig
     from ..model.idesplat import IDESplat
+    from .losses import Perceptual
     from .parallel import Team
     from .training_data import Order, Views
     from .training_log import TrainingLog
@@ -58,6 +60,8 @@ class Settings:
     scenes: int = 0
     real_ratio: float = 1.0
     precision: str = "float32"
+    textures: str = ""
+    perceptual: str = "lpips"
 
 
 @exit_on_input_error
@@ -71,6 +75,9 @@ def train(
         typer.Option(
             help="Folder with photographs and transforms.json, instead of drawn scenes; every eighth is for validation."
         ),
+    ] = None,
+    textures: Annotated[
+        Path | None, typer.Option(help="Folder of images for the textures of synthetic scenes, beside generated ones.")
     ] = None,
     real_ratio: Annotated[
         float, typer.Option(help="Share of the scenes taken from --data; the others are synthetic.", min=0, max=1)
@@ -94,6 +101,10 @@ def train(
     lr: Annotated[float, typer.Option(help="Highest learning rate.", min=0)] = 1e-3,
     vit_lr: Annotated[float, typer.Option(help="Highest learning rate of the ViT.", min=0)] = 5e-4,
     seed: Annotated[int, typer.Option(help="Of the weights and the scenes.", min=0)] = 0,
+    perceptual: Annotated[
+        PerceptualKind,
+        typer.Option(help="Of rendered views: LPIPS where it is, EfficientNet-Lite0's features, or none."),
+    ] = PerceptualKind.LPIPS,
     precision: Annotated[
         Precision, typer.Option(help="Of convolutions and attention; bfloat16 is quicker where the CPU has it.")
     ] = Precision.FLOAT32,
@@ -124,6 +135,8 @@ def train(
         scenes if head else 0,
         real_ratio,
         precision.value,
+        str(textures.resolve()) if textures else "",
+        perceptual.value,
     )
     config = _config(settings)
     _announce(out, init, data or [])
@@ -325,18 +338,23 @@ def _sources(
     settings: Settings, config: "IDESplatConfig"
 ) -> "tuple[Callable[[Order], Views], Callable[[Order], Views]]":
     """What makes the views of training and of validation: synthetic scenes, the given folders, or both."""
+    from .photo_textures import photo_textures
     from .training_data import draw_views
 
+    photos = Path(settings.textures) if settings.textures else None
+    if photos is not None:
+        photo_textures(photos)
+    synthetic = partial(draw_views, photos=photos)
     if not settings.data:
-        return draw_views, draw_views
+        return synthetic, synthetic
     from .training_folders import FolderScenes
 
     captures = FolderScenes([Path(folder) for folder in settings.data], config.near, config.far)
     if settings.real_ratio == 1:
         return captures.draw, captures.draw_held_out
     return (
-        lambda order: captures.draw(order) if order.real else draw_views(order),
-        lambda order: captures.draw_held_out(order) if order.real else draw_views(order),
+        lambda order: captures.draw(order) if order.real else synthetic(order),
+        lambda order: captures.draw_held_out(order) if order.real else synthetic(order),
     )
 
 
@@ -353,17 +371,28 @@ def _task(
     """What the settings ask for; features: the folder of cached features."""
     from ..model.gaussian_head import HeadInputs
     from .head_training import FeatureCache
-    from .losses import load_perceptual
     from .training_tasks import HeadTask, WholeTask
 
     size, batch = settings.size, settings.batch
     if settings.part == Part.HEAD:
-        cache = FeatureCache(features, model, source, repr((size, settings.data, HeadInputs._fields)))
-        return HeadTask(cache, settings.seed, size, batch, settings.scenes, settings.real_ratio, load_perceptual())
+        cache = FeatureCache(
+            features, model, source, repr((size, settings.data, settings.textures, HeadInputs._fields))
+        )
+        return HeadTask(cache, settings.seed, size, batch, settings.scenes, settings.real_ratio, _perceptual(settings))
     objective = Objective(settings.objective)
     phases = curriculum(objective, settings.gradual)
-    perceptual = load_perceptual() if any(phase.gaussians for phase in phases) else None
+    perceptual = _perceptual(settings) if any(phase.gaussians for phase in phases) else None
     return WholeTask(phases, objective, settings.seed, size, source, settings.real_ratio, perceptual)
+
+
+def _perceptual(settings: Settings) -> "Perceptual | None":
+    """The perceptual distance that the settings ask for, where it can be had."""
+    from .losses import load_perceptual
+    from .perceptual import PhotographicDistance
+
+    if settings.perceptual == PerceptualKind.LITE0:
+        return PhotographicDistance()
+    return load_perceptual() if settings.perceptual == PerceptualKind.LPIPS else None
 
 
 def _prepare_process(threads: int) -> None:

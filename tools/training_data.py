@@ -4,13 +4,17 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from .scenes import TRAINING_SEEDS, Sample, draw_sample
+from .photo_textures import joined, photo_textures
+from .scene_textures import Textures
+from .scenes import TRAINING_SEEDS, Sample, draw_sample, scene_textures
 
 # Share of the scenes with three context views instead of two.
 THREE_VIEW_SHARE = 0.06
@@ -73,10 +77,20 @@ def to_views(sample: Sample) -> Views:
     )
 
 
-def draw_views(order: Order) -> Views:
-    """The scene of an order; the same order gives the same scene."""
-    targets = len(order.closer)
-    return to_views(draw_sample(order.seed, order.context, targets, order.height, order.width, closer=order.closer))
+def draw_views(order: Order, photos: Path | None = None) -> Views:
+    """The scene of an order; the same order gives the same scene.
+
+    photos: a folder of images for the textures of training scenes, beside the generated ones.
+    """
+    bank = _with_photos(photos) if photos is not None and order.seed in TRAINING_SEEDS else None
+    size = order.height, order.width
+    return to_views(draw_sample(order.seed, order.context, len(order.closer), *size, closer=order.closer, bank=bank))
+
+
+@cache
+def _with_photos(folder: Path) -> Textures:
+    """The textures of training scenes, and those of a folder."""
+    return joined(scene_textures(TRAINING_SEEDS.start), photo_textures(folder))
 
 
 def training_order(

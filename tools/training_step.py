@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -18,8 +18,8 @@ from .losses import (
     coarse_bin,
     inverse_depth_loss,
     monocular_loss,
-    photometric_loss,
-    splat_loss,
+    offset_loss,
+    render_loss,
     unit_loss,
 )
 from .torch_rasterizer import rasterize
@@ -75,6 +75,16 @@ def render_targets(gaussians: tuple[Tensor, ...], views: Views) -> Tensor:
     return torch.stack(images).permute(0, 3, 1, 2)
 
 
+def with_input_view(views: Views, index: int) -> Views:
+    """The same views, whose targets are followed by one of the context views."""
+    return replace(
+        views,
+        target_images=torch.cat([views.target_images, views.images[index : index + 1]]),
+        target_extrinsics=torch.cat([views.target_extrinsics, views.extrinsics[index : index + 1]]),
+        target_intrinsics=torch.cat([views.target_intrinsics, views.intrinsics[index : index + 1]]),
+    )
+
+
 @contextmanager
 def matching_scores(model: IDESplat) -> Iterator[list[Tensor]]:
     """Collect what each epipolar layer hands to its regulariser, two layers a unit, [pairs, candidates, h, w] each."""
@@ -93,9 +103,14 @@ def matching_scores(model: IDESplat) -> Iterator[list[Tensor]]:
 
 
 def scene_loss(
-    model: IDESplat, views: Views, phase: Phase, objective: Objective, perceptual: Perceptual | None
+    model: IDESplat, views: Views, phase: Phase, objective: Objective, perceptual: Perceptual | None, turn: int = 0
 ) -> tuple[Tensor, dict[str, float]]:
-    """The loss of a scene, and what is logged of it."""
+    """The loss of a scene, and what is logged of it.
+
+    Where novel views are rendered, an input view is, too, from the Gaussians of all views; turn: says which.
+    """
+    if phase.gaussians:
+        views = with_input_view(views, turn % len(views.images))
     with matching_scores(model) as scores:
         outcome = run_phase(model, views, phase)
     loss = torch.zeros(())
@@ -108,10 +123,10 @@ def scene_loss(
             loss = loss + unit_loss(unit, of_layers, views.inverse_depth, bins)
         if phase.units == 3:
             loss = loss + inverse_depth_loss(outcome.inverse_depth, views.inverse_depth[:, None], bins)
-    if outcome.raw is not None and model.config.scale_in_pixels:
-        loss = loss + splat_loss(outcome.raw)
+    if outcome.raw is not None:
+        loss = loss + offset_loss(outcome.raw)
     if outcome.rendered is not None:
-        loss = loss + PHOTOMETRIC_SHARE * photometric_loss(outcome.rendered, views.target_images, perceptual)
+        loss = loss + PHOTOMETRIC_SHARE * render_loss(outcome.rendered, views.target_images, perceptual)
     return loss, {"loss": float(loss.detach()), **entry}
 
 

@@ -79,7 +79,7 @@ class WholeTask(TrainingTask[Views]):
 
     def loss(self, model: IDESplat, sample: Views, step: int, phase: Phase) -> Losses:
         """As `scene_loss`."""
-        return scene_loss(model, sample, phase, self.objective, self.perceptual)
+        return scene_loss(model, sample, phase, self.objective, self.perceptual, step)
 
 
 class HeadTask(TrainingTask[HeadSample]):
