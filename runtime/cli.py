@@ -287,6 +287,7 @@ def _announce_pictures(
     from .input_files import named_images
 
     run, stems = outputs(), _stems(inputs.views)
+    run.reads("a photograph", inputs.photographs)
     if given.cameras != ESTIMATE:
         run.reads("a photograph", named_images(Path(given.cameras), inputs.cameras))
     if save_depth is not None:

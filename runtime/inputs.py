@@ -44,10 +44,12 @@ class Request:
 class Inputs:
     """What the network takes, and how it came about.
 
-    views: the chosen photographs with their cameras. cameras: those of all photographs. notes: lines for the user.
+    views: the chosen photographs with their cameras. photographs: the files of all, chosen or not. cameras: those of
+    all photographs. notes: lines for the user.
     """
 
     views: Views
+    photographs: list[Path]
     cameras: list[Camera]
     notes: list[str]
 
@@ -60,7 +62,7 @@ def read_inputs(request: Request, runner: Runner) -> Inputs:
     notes = describe_unread(request.images)
     with scratch_folder() as folder:
         given = None if request.cameras == ESTIMATE else Path(request.cameras)
-        images = find_photographs(request.images, given, request.camera_format, folder)
+        photographs = images = find_photographs(request.images, given, request.camera_format, folder)
         decoded: dict[Path, np.ndarray] = {}
         if given is None:
             from .estimate import estimate_cameras
@@ -96,7 +98,7 @@ def read_inputs(request: Request, runner: Runner) -> Inputs:
             f"{count} of {len(pairs)} photographs used: {', '.join(views.names)}; {views.choice} "
             "(--views for more, --frames to choose)"
         )
-    return Inputs(views, own, notes)
+    return Inputs(views, photographs, own, notes)
 
 
 def pick_frames(images: Sequence[Path], frames: str | None) -> list[Path]:

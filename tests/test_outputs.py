@@ -202,6 +202,14 @@ def test_infer_never_replaces_what_it_reads(workplace, capfd, name, overwrite):
     assert expected in refused(capfd, workplace, infer, *given)
 
 
+@pytest.mark.parametrize("option", [("--save-depth", "images"), ("--report", "images/001.png")])
+@pytest.mark.parametrize("way", [as_names_without_suffix, as_own_json_elsewhere])
+def test_infer_never_replaces_photographs_that_only_the_cameras_name(dataset, capfd, way, option):
+    cameras, _ = way(dataset)
+    given = ["--cameras", cameras, "--out", "new.ply", "--near", "1", "--far", "9"]  # the carried model
+    assert "would replace a photograph" in refused(capfd, dataset, infer, *given, *option, "--overwrite")
+
+
 def test_infer_leaves_what_is_not_its_own(workplace, capfd):
     given = [part for option in USUAL.items() for part in option]
     line = refused(capfd, workplace, infer, *given, "--json", "notes.json")
