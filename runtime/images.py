@@ -13,7 +13,7 @@ import numpy as np
 
 from .cameras import Camera
 from .errors import InputError
-from .files import read_bytes
+from .files import check_regular, read_bytes
 from .image_header import HEIF, DamagedImage, ImageHeader, opened, read_header
 from .video import SUFFIXES as VIDEO_SUFFIXES
 
@@ -167,6 +167,8 @@ def _images_of(item: str | Path) -> list[Path]:
     path = Path(item)
     expected = f"expected {', '.join(SUFFIXES)}"
     files = _files_of(item)
+    if path.exists() and not path.is_dir():
+        check_regular(path)
     if path.is_file() and path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: not an image by its suffix; {expected}, or one video ({', '.join(VIDEO_SUFFIXES)})")
     if not files and not path.is_dir():

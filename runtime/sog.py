@@ -210,7 +210,8 @@ class _Reader:
         """All that the archive holds."""
         lower, upper = (self._pixels("means", index)[:, :3].astype(np.float64) for index in (0, 1))
         low, high = (self._numbers("means", end, 3) for end in ("mins", "maxs"))
-        logs = low + (high - low) * ((lower + 256 * upper) / POSITION_STEPS)
+        with np.errstate(over="ignore", invalid="ignore"):  # to infinity or NaN, which are refused later
+            logs = low + (high - low) * ((lower + 256 * upper) / POSITION_STEPS)
         rotations, colours = self._pixels("quats"), self._pixels("sh0")
         for name, pixels in (("quats", rotations), ("sh0", colours)):
             if pixels.shape[1] != 4:

@@ -225,6 +225,10 @@ BROKEN_SOG = {
     "short codebook": (lambda files, meta: meta["sh0"]["codebook"].pop(), r"sh0.codebook has shape \(255,\)"),
     "words in a codebook": (lambda files, meta: meta["sh0"].update(codebook=["x"] * 256), "ValueError"),
     "NaN": (lambda files, meta: meta["scales"].update(codebook=[float("nan")] * 256), "scales of Gaussian 0 is not"),
+    "an infinite end": (
+        lambda files, meta: meta["means"].update(mins=[float("-inf")] * 3),
+        "means of Gaussian 0 is not",
+    ),
     "degree 7": (lambda files, meta: meta["shN"].update(bands=7), "harmonics of degree 7"),
     "sets that are not there": (
         lambda files, meta: files.update({"shN_labels.webp": webp((4, 4, 3))}),
@@ -238,7 +242,8 @@ def test_broken_sog_files_are_named(tmp_path: Path, written: dict[str, bytes], n
     change, message = BROKEN_SOG[name]
     path = tmp_path / "broken.sog"
     path.write_bytes(sog(written[".sog"], change))
-    with pytest.raises(InputError, match=message) as caught:
+    with warnings.catch_warnings(), pytest.raises(InputError, match=message) as caught:
+        warnings.simplefilter("error")
         read_scene(path)
     assert str(path) in str(caught.value)
 

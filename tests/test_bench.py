@@ -235,7 +235,7 @@ def test_where_nothing_can_be_measured_it_says_why(exported, capsys):
         (("--sizes", "large"), "HEIGHTxWIDTH"),
         (("nowhere.onnx",), "nowhere.onnx: no such model"),
         (("--json", "/proc/nowhere/bench.json"), "cannot write into /proc"),
-        (("--compare", "nowhere.json"), "cannot read nowhere.json"),
+        (("--compare", "nowhere.json"), "nowhere.json: cannot be read"),
     ],
 )
 def test_bad_input_gets_one_line(arguments, expected, tmp_path, monkeypatch, capsys):
