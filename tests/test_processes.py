@@ -89,6 +89,41 @@ def test_no_code_of_the_current_folder_runs_in_benchmarks(tmp_path):
     assert not sprung.exists()
 
 
+TRAINING = """
+from pathlib import Path
+
+from idesplat.tools.parallel import other_processes
+
+def work(team):
+    Path("worked").touch()
+
+if __name__ == "__main__":
+    with other_processes(2, work):
+        pass
+"""
+
+
+def test_no_code_of_the_current_folder_runs_in_training(tmp_path):
+    """Two processes; the second one is started by multiprocessing."""
+    sprung = set_traps(tmp_path)
+    script = tmp_path.parent / f"{tmp_path.name}.py"
+    script.write_text(TRAINING)
+    done = subprocess.run([sys.executable, script], cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert not sprung.exists()
+
+
+def test_no_code_of_the_current_folder_runs_in_benchmarks_of_training(tmp_path, monkeypatch):
+    from idesplat.tools import bench_training
+
+    sprung = set_traps(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    phase = next(iter(bench_training.PHASES))
+    measured = bench_training._measure(phase, bench_training.Candidate("idesplat-tiny", "float32", 1, 1), 1)
+    assert measured["scenes"] == 1
+    assert not sprung.exists()
+
+
 def test_modules_that_run_as_programs_do_not_look_in_the_current_folder(tmp_path):
     """Even without -P: what Python itself imports before it gets to our code is beyond us."""
     (tmp_path / "numpy.py").write_text("raise SystemExit('the current folder')")

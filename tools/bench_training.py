@@ -4,13 +4,14 @@ import json
 import os
 import subprocess
 import sys
-import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from ..runtime.files import scratch_folder
 
 if TYPE_CHECKING:
     from .parallel import Team
@@ -67,7 +68,7 @@ def bench_training(rounds: int, steps: int) -> None:
 
 def _measure(phase: str, candidate: Candidate, steps: int) -> dict[str, Any]:
     """One candidate in a process of its own, which has others of its own."""
-    command = [sys.executable, "-m", __name__, phase, json.dumps(list(vars(candidate).values())), str(steps)]
+    command = [sys.executable, "-P", "-m", __name__, phase, json.dumps(list(vars(candidate).values())), str(steps)]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, check=True, capture_output=True, text=True, env=environment)
     return json.loads(done.stdout.splitlines()[-1])
@@ -77,9 +78,9 @@ def _worker(phase: str, candidate: Candidate, steps: int) -> None:
     """What the process of a measurement does; it prints seconds, CPU seconds of all processes, scenes and shares."""
     from .parallel import Team, other_processes
 
-    with tempfile.TemporaryDirectory() as folder:
-        run = _run_at(Path(folder), phase, candidate, Team(0, candidate.processes))
-        with other_processes(candidate.processes, _other, Path(folder), phase, candidate, steps):
+    with scratch_folder() as folder:
+        run = _run_at(folder, phase, candidate, Team(0, candidate.processes))
+        with other_processes(candidate.processes, _other, folder, phase, candidate, steps):
             print(json.dumps(_timed_steps(run, steps)))
 
 

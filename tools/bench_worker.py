@@ -2,13 +2,11 @@
 
 import json
 import multiprocessing
-import os
 import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from math import prod
 from multiprocessing.connection import Connection
@@ -16,6 +14,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+
+from .child_processes import safe_path
 
 # Of the square matrices whose product says what the machine can do: large enough to be as fast as it gets.
 MATRIX_SIDE = 2048
@@ -28,7 +28,6 @@ LOOPS = ("Scan", "Loop", "If")
 # Operators whose FLOP are counted, as a graph has them before it is optimised.
 PRODUCTS = ("MatMul", "MatMulInteger", "Gemm", "Conv", "ConvTranspose")
 RUN = "run"
-SAFE_PATH = "PYTHONSAFEPATH"
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,7 @@ class Worker:
         context = multiprocessing.get_context("spawn")
         self._pipe, other = context.Pipe()
         self._process = context.Process(target=_serve, args=(other, prepare, arguments), daemon=True)
-        with _safe_path():
+        with safe_path():
             self._process.start()
         other.close()
         self.about = self._answer()
@@ -96,20 +95,6 @@ class Worker:
         if isinstance(answer, Failed):
             raise answer
         return answer
-
-
-@contextmanager
-def _safe_path() -> Iterator[None]:
-    """Keep the Python processes that start meanwhile from importing modules of the current folder."""
-    before = os.environ.get(SAFE_PATH)
-    os.environ[SAFE_PATH] = "1"
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ[SAFE_PATH]
-        else:
-            os.environ[SAFE_PATH] = before
 
 
 def _serve(pipe: Connection, prepare: Callable[..., Prepared], arguments: tuple) -> None:

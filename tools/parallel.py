@@ -7,7 +7,6 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -15,6 +14,8 @@ import torch.distributed as dist
 from torch import nn
 
 from ..runtime.errors import InputError
+from ..runtime.files import scratch_folder
+from .child_processes import safe_path
 
 # Gloo finds its address by the host's name, which need not resolve; all processes are on this machine.
 INTERFACE_VARIABLE = "GLOO_SOCKET_IFNAME"
@@ -73,14 +74,15 @@ def other_processes(size: int, work: Callable[..., None], *arguments: Any) -> It
         yield
         return
     context = multiprocessing.get_context("spawn")
-    with TemporaryDirectory() as folder:
-        store = Path(folder) / "store"
+    with scratch_folder() as folder:
+        store = folder / "store"
         others = [
             context.Process(target=_run, args=(rank, size, store, work, arguments), daemon=True)
             for rank in range(1, size)
         ]
-        for process in others:
-            process.start()
+        with safe_path():
+            for process in others:
+                process.start()
         _join(0, size, store)
         try:
             yield
