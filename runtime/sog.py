@@ -13,6 +13,8 @@ import json
 import struct
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from math import ceil, sqrt
 from pathlib import Path
 from typing import Any
@@ -91,16 +93,8 @@ def write_sog(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None
 
 def read_sog(path: Path) -> Gaussians:
     """Read a .sog; raises InputError if the file cannot be read, is not of version 2, or is damaged."""
-    content = read_bytes(path, EXPECTED)
-    try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            gaussians = _Reader(path, archive, len(content)).read()
-    except InputError:
-        raise
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, struct.error):
-        refuse(path, "not a zip archive, or damaged", f"expected {EXPECTED}")
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        refuse(path, f"not a .sog as it should be ({type(error).__name__}: {str(error)[:60]})", "write it again")
+    with _opened(path) as reader:
+        gaussians = reader.read()
     check_finite(path, gaussians)
     return gaussians
 
@@ -110,18 +104,25 @@ def sog_offset(path: Path) -> np.ndarray:
 
     Raises InputError as `read_sog`.
     """
+    with _opened(path) as reader:
+        asset = reader.meta.get("asset")
+    found = asset.get(OFFSET) if isinstance(asset, dict) else None
+    return np.zeros(3) if found is None else checked_offset(path, found)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator["_Reader"]:
+    """A reader of the archive; InputError is raised for whatever goes wrong inside the block, too."""
     content = read_bytes(path, EXPECTED)
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            asset = _Reader(path, archive, len(content)).meta.get("asset")
+            yield _Reader(path, archive, len(content))
     except InputError:
         raise
     except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, struct.error):
         refuse(path, "not a zip archive, or damaged", f"expected {EXPECTED}")
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
         refuse(path, f"not a .sog as it should be ({type(error).__name__}: {str(error)[:60]})", "write it again")
-    found = asset.get(OFFSET) if isinstance(asset, dict) else None
-    return np.zeros(3) if found is None else checked_offset(path, found)
 
 
 def _coded(values: np.ndarray, name: str, alpha: np.ndarray | None = None) -> tuple[bytes, dict[str, Any]]:
