@@ -10,6 +10,18 @@ from .images import SUFFIXES, find_images, stem
 GIVE_PICTURES = "give the pictures with --images, which idesplat-cameras convert takes, too"
 
 
+# Where datasets keep the images that a camera file names: in its own folder, and in these of it and of those above,
+# since COLMAP's models lie in `sparse/0`.
+IMAGE_FOLDERS = ("images", "image", "blended_images")
+FOLDERS_ABOVE = 3
+
+
+def image_roots(cameras: Path) -> list[Path]:
+    """The folder of a camera file, or the folder of cameras itself, and those above it that may hold its images."""
+    folder = cameras if os.path.isdir(cameras) else cameras.parent
+    return [folder, *folder.resolve().parents[:FOLDERS_ABOVE]]
+
+
 class PictureSizes:
     """Sizes of the pictures that cameras name.
 

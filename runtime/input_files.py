@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from .cameras import Camera
 
-# Where photographs lie, seen from the file or folder of cameras: COLMAP's models stand up to three folders below.
-LEVELS_UP = 3
-IMAGE_FOLDERS = ("", "images", "input")
+# Where else datasets keep photographs, which no command of ours reads there unasked.
+UNDISTORTED_FROM = "input"
 
 
 def model_files(model: Path) -> list[Path]:
@@ -71,17 +70,17 @@ def nearby_images(path: Path, cameras: Iterable["Camera"]) -> list[Path]:
 
     path: the file or folder that the cameras were read from, such as `sparse/0` beside a folder `images`.
     """
+    from .camera_pictures import IMAGE_FOLDERS, image_roots
     from .images import SUFFIXES, stem
 
     stems_in = defaultdict(set)  # folder of a name -> its stems
     for camera in cameras:
         name = _posix(camera.name)
         stems_in[name.parent].add(stem(name))
-    folder = Path(os.path.abspath(path if os.path.isdir(path) else path.parent))
-    roots = [folder, *folder.parents][: 1 + LEVELS_UP]
+    roots, names = image_roots(path), ("", *IMAGE_FOLDERS, UNDISTORTED_FROM)
     found = []
     for below, stems in stems_in.items():
-        for place in dict.fromkeys(root / name / below for root in roots for name in IMAGE_FOLDERS):
+        for place in dict.fromkeys(root / name / below for root in roots for name in names):
             children = (child for child in _children(place) if child.suffix.lower() in SUFFIXES)
             found += [child for child in children if stem(child) in stems]
     return found

@@ -5,16 +5,12 @@ from pathlib import Path
 
 from . import video
 from .camera_format import CameraFormat
-from .camera_pictures import picture_paths
+from .camera_pictures import IMAGE_FOLDERS, image_roots, picture_paths
 from .cameras import read_cameras, recognise
 from .cameras_re10k import timestamps
 from .errors import InputError
 from .images import find_images
 
-# Where the images that a camera file names are looked for: in its own folder, and in these of it and of those above,
-# since COLMAP's models lie in `sparse/0`.
-IMAGE_FOLDERS = ("images", "image", "blended_images")
-FOLDERS_ABOVE = 3
 EXAMPLES = 3  # names in a message
 
 
@@ -43,9 +39,8 @@ def _named_photographs(cameras: Path | None, camera_format: CameraFormat | None)
     if cameras is None:
         raise InputError("--images is missing: photographs without cameras are to be given")
     names = _names(cameras, camera_format)
-    folder = cameras if cameras.is_dir() else cameras.parent
-    above = [folder, *folder.resolve().parents[:FOLDERS_ABOVE]]
-    for place in (folder, *(parent / name for parent in above for name in IMAGE_FOLDERS)):
+    roots = image_roots(cameras)
+    for place in (roots[0], *(root / name for root in roots for name in IMAGE_FOLDERS)):
         found = [path for name in names if (path := _file(place, name)) is not None]
         if found:
             return found

@@ -96,6 +96,13 @@ def as_colmap(dataset):
     return model, dataset / "images"
 
 
+def as_another_folder_that_is_read(dataset):
+    """Where idesplat-infer without --images finds them."""
+    (dataset / "images").rename("blended_images")
+    write_cameras(dataset / "transforms.json", pinholes([FIRST, SECOND]))
+    return dataset / "transforms.json", Path("blended_images")
+
+
 def as_own_json_elsewhere(dataset):
     (dataset / "elsewhere").mkdir()
     write_cameras(dataset / "elsewhere" / "cameras.json", pinholes([FIRST, SECOND]))
@@ -122,6 +129,7 @@ RENDERS = [
     as_folder,
     as_names_without_suffix,
     as_colmap,
+    as_another_folder_that_is_read,
     as_own_json_elsewhere,
     as_file_and_link,
     as_hard_links,
