@@ -12,7 +12,7 @@ $(VENV)/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[dev]"
 	mkdir -p .typing/idesplat
-	for package in model export runtime tools; do ln -sfn ../../$$package .typing/idesplat/$$package; done
+	for part in __init__.py model export runtime tools; do ln -sfn ../../$$part .typing/idesplat/$$part; done
 	touch $@
 
 # Lint, types and tests.
@@ -26,7 +26,7 @@ check: setup
 
 # Photographs of a drawn room to a splat, in demo/.
 demo: setup
-	$(BIN)/python -P -m idesplat.tools.demo demo
+	$(BIN)/python -P -m idesplat.tools.figures.demo demo
 
 # Photographs under free licences (MODEL_CARD.md) for the textures of training scenes; it needs Debian's apt and git.
 TEXTURES := gnome-backgrounds mate-backgrounds plasma-workspace-wallpapers
@@ -46,7 +46,7 @@ weights: setup runs/textures
 	$(BIN)/idesplat-train --out runs/head --train head --init runs/lite/last.ckpt --preset idesplat-lite \
 		--textures runs/textures --scenes 2000 --steps 5000 --batch 2 --processes 2 --precision bf16 --lr 3e-4 \
 		--size 256 --seed 1
-	$(BIN)/python -P -m idesplat.tools.carry runs/head/last.ckpt --preset idesplat-lite
+	$(BIN)/python -P -m idesplat.tools.training.release runs/head/last.ckpt --preset idesplat-lite
 
 clean:
 	rm -rf $(VENV) build .typing *.egg-info

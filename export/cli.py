@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ..runtime.bundle import Description, StageFile, write_manifest
+from ..runtime.cli.outputs import Overwrite, guards_outputs, outputs
+from ..runtime.cli.terminal import run, say, warn
 from ..runtime.errors import InputError, exit_on_input_error
-from ..runtime.files import check_writable, make_folder
-from ..runtime.outputs import Overwrite, guards_outputs, outputs
-from ..runtime.sizes import parse_size, size_fits, size_rule
-from ..runtime.terminal import run, say, warn
+from ..runtime.images.sizes import parse_size, size_fits, size_rule
+from ..runtime.inference.metadata import Description, StageFile, write_manifest
+from ..runtime.system.files import check_writable, make_folder
 
 if TYPE_CHECKING:
-    from ..model.networks import Network
-    from .exporter import Fixed, Graphs
+    from ..model.registry import Network
+    from .freeze import Fixed, Graphs
     from .stages import Stage
 
 MISMATCH = 1
@@ -58,8 +58,8 @@ def export(
     if find_spec("torch") is None or find_spec("onnx") is None:
         raise InputError("exporting needs PyTorch and onnx, which are not installed; pip install 'idesplat[export]'")
     from ..model.checkpoint import CheckpointError
-    from .exporter import Fixed
-    from .precision import PRECISIONS
+    from .freeze import Fixed
+    from .precision.parts import PRECISIONS
 
     if precision not in PRECISIONS:
         raise InputError(f"--precision {precision}: unknown; choose one of {', '.join(PRECISIONS)}")
@@ -128,7 +128,7 @@ def _fitting_size(text: str, views: int | None, multiple: int) -> tuple[int, int
     height, width = parse_size(text)
     if not size_fits(height, width, multiple):
         raise InputError(f"--size {text}: {size_rule(multiple)}")
-    from .cases import MOST_VIEWS_OF_A_CASE
+    from .validation.cases import MOST_VIEWS_OF_A_CASE
 
     count = views or MOST_VIEWS_OF_A_CASE
     if count * height * width > MOST_PIXELS:
@@ -142,7 +142,7 @@ def _load(checkpoint: Path, preset: str | None) -> "tuple[Network, str, str]":
     """The network with the file's weights, the preset's name, and the file's SHA-256."""
     from ..model.checkpoint import file_sha256, fill, infer_preset, name_hash_warning, read_state_dict
     from ..model.config import PRESETS
-    from ..model.networks import build
+    from ..model.registry import build
 
     if preset is not None and preset not in PRESETS:
         raise InputError(f"--preset {preset}: unknown; choose one of {', '.join(PRESETS)}")
@@ -164,7 +164,7 @@ def describe(
     model: "Network", preset: str, checkpoint: str, digest: str, fixed: "Fixed", precision: str = "float32"
 ) -> Description:
     """What an exported network says of itself."""
-    from ..model.depthsplat import DepthSplatDepth
+    from ..model.depthsplat.network import DepthSplatDepth
 
     config = model.config
     height, width = fixed.size or (config.height, config.width)
@@ -198,11 +198,11 @@ def _export(
     """
     from rich.console import Console
 
-    from .exporter import OPSET, freeze
-    from .report import print_details, print_summary
+    from .freeze import OPSET, freeze
+    from .graph.external_data import check_weights, hand_out, publish
     from .stages import NamedTensors
-    from .verify import Exported, verify
-    from .weights import check_weights, hand_out, publish
+    from .validation.compare import Exported, verify
+    from .validation.report import print_details, print_summary
     from .written import replace_folder, working_folder
 
     console = Console(stderr=True)
@@ -240,7 +240,7 @@ def _export(
 
 def _write_stages(graphs: "Graphs", folder: Path) -> "list[tuple[Stage, Path]]":
     """Write one graph a stage and the manifest into an empty folder; the stages, each with its graph."""
-    from .weights import hand_out
+    from .graph.external_data import hand_out
 
     files = [
         StageFile(stage.name, f"{stage.name}.onnx", list(stage.inputs), list(stage.outputs)) for stage in graphs.stages

@@ -11,11 +11,11 @@ import onnx
 import torch
 from torch import Tensor, nn
 
-from ..model.depth_stage import PredictedDepth
-from ..model.gaussian_head import Predicted
-from ..model.networks import Network
-from ..runtime.bundle import INPUTS
-from .nodes import names_read, nodes_between
+from ..model.depthsplat.depth_stage import PredictedDepth
+from ..model.idesplat.gaussian_head import Predicted
+from ..model.registry import Network
+from ..runtime.inference.metadata import INPUTS
+from .graph.nodes import names_read, nodes_between
 
 
 @dataclass(frozen=True)

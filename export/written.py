@@ -18,8 +18,8 @@ from pathlib import Path
 import onnx
 from onnx.external_data_helper import ExternalDataInfo
 
-from ..runtime.bundle import MANIFEST_NAME, METADATA_KEY
 from ..runtime.errors import InputError
+from ..runtime.inference.metadata import MANIFEST_NAME, METADATA_KEY
 
 # The manifest's field "format" of a staged folder, as `write_manifest` writes it.
 STAGED_FORMAT = "idesplat-staged"

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from .config import PRESETS, DepthSplatConfig, IDESplatConfig
-from .idesplat import IDESplat
-from .networks import Network, build
+from .idesplat.network import IDESplat
+from .registry import Network, build
 
 # Where a state dict may be nested in a file, and the prefix of the encoder's keys in it.
 CONTAINERS = ("state_dict", "model")

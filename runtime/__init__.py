@@ -9,27 +9,28 @@ from typing import TYPE_CHECKING
 from . import startup as startup
 
 if TYPE_CHECKING:
-    from .cameras import Camera, read_cameras
+    from .cameras.camera import Camera
+    from .cameras.io import read_cameras
     from .errors import InputError
-    from .formats import read_offset, read_scene, write_scene
-    from .gaussians import Gaussians
-    from .ply import read_ply, write_ply
-    from .rasterizer import rasterize
-    from .runner import Prediction, Runner
+    from .inference.predictor import Prediction, Runner
+    from .rendering.rasterizer import rasterize
+    from .splats.formats.ply import read_ply, write_ply
+    from .splats.gaussians import Gaussians
+    from .splats.io import read_offset, read_scene, write_scene
 
 _MODULE_OF = {
-    "Camera": "cameras",
-    "Gaussians": "gaussians",
+    "Camera": "cameras.camera",
+    "Gaussians": "splats.gaussians",
     "InputError": "errors",
-    "Prediction": "runner",
-    "Runner": "runner",
-    "rasterize": "rasterizer",
-    "read_cameras": "cameras",
-    "read_offset": "formats",
-    "read_ply": "ply",
-    "read_scene": "formats",
-    "write_ply": "ply",
-    "write_scene": "formats",
+    "Prediction": "inference.predictor",
+    "Runner": "inference.predictor",
+    "rasterize": "rendering.rasterizer",
+    "read_cameras": "cameras.io",
+    "read_offset": "splats.io",
+    "read_ply": "splats.formats.ply",
+    "read_scene": "splats.io",
+    "write_ply": "splats.formats.ply",
+    "write_scene": "splats.io",
 }
 
 __all__ = [

@@ -9,7 +9,8 @@ import functools
 import signal
 import sys
 import unicodedata
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -86,3 +87,17 @@ def _is_shown(character: str) -> bool:
 
 def _escape(character: str) -> str:
     return character.encode("unicode_escape").decode("ascii")
+
+
+@contextmanager
+def located(where: str) -> Iterator[None]:
+    """Put `where` (a file, a frame, a field) in front of the message of an InputError raised inside the block.
+
+    Once only: what reads a whole file begins with its path, which may end in `where`, or lead through it.
+    """
+    try:
+        yield
+    except InputError as error:
+        path = Path(str(error).partition(": ")[0])
+        known = where in (path.name, str(path), *map(str, path.parents))
+        raise InputError(str(error) if known else f"{where}: {error}") from None

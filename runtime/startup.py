@@ -4,7 +4,7 @@ import os
 import sys
 from contextlib import suppress
 
-from .user_cache import cache_folder
+from .system.cache_folder import cache_folder
 
 # ONNX Runtime would write a device id and a queue of events into the user's cache, and connect to its vendor. It reads
 # this when it is first imported; its function `disable_telemetry_events` comes too late.

@@ -14,16 +14,8 @@ os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(Path(__file__).parent.parent / ".pyt
 import idesplat.runtime  # noqa: F401  # first: it switches ONNX Runtime's telemetry off
 import pytest
 import torch
-from idesplat.model.config import (
-    PRESETS,
-    DPBUConfig,
-    DPTConfig,
-    FocusConfig,
-    IDESplatConfig,
-    UNetConfig,
-    ViTConfig,
-)
-from idesplat.model.idesplat import IDESplat
+from idesplat.model.config import PRESETS, DPBUConfig, DPTConfig, FocusConfig, IDESplatConfig, UNetConfig, ViTConfig
+from idesplat.model.idesplat.network import IDESplat
 
 SMALL_PRESET = "idesplat-small"
 SMALL = IDESplatConfig(
@@ -108,7 +100,7 @@ def exported(small_checkpoint, presets, tmp_path_factory) -> tuple[Path, Path]:
 @pytest.fixture(scope="session")
 def scene(tmp_path_factory) -> Path:
     """A folder with five photographs of a procedural room and transforms.json."""
-    from idesplat.tools.make_scene import make_scene
+    from idesplat.tools.synthetic.make_scene import make_scene
 
     folder = tmp_path_factory.mktemp("scene")
     make_scene(folder, seed=2, views=5, height=96, width=128)

@@ -1,0 +1,177 @@
+"""Freeze a network: one trace to one ONNX graph, from which the stages' graphs are cut."""
+
+import copy
+import logging
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import onnx
+import torch
+
+from ..runtime.inference.metadata import INPUTS, METADATA_KEY, OUTPUTS, Description
+from .graph.cleanup import simplify
+from .graph.external_data import fill_inputs
+from .graph.gather_loops import explain, in_steps
+from .precision.int8 import Feeds
+from .precision.parts import in_precision
+from .room import room_inputs
+from .stages import NamedTensors, Stage, example_inputs, find_stages, stage_graph
+
+OPSET = 20
+IR_VERSION = 10
+# Traced with views and sizes that no other number in the network equals; the graph is dynamic in all three.
+TRACE_VIEWS = 4
+TRACE_BLOCKS = (6, 8)
+DYNAMIC = {
+    "images": {0: "views", 2: "height", 3: "width"},
+    "extrinsics": {0: "views"},
+    "intrinsics": {0: "views"},
+    "near": {0: "views"},
+    "far": {0: "views"},
+    "depth": {0: "views", 1: "height", 2: "width"},
+    **{name: {0: "gaussians"} for name in OUTPUTS if name != "depth"},
+}
+PRODUCER = "idesplat"
+# Files of the folder that is worked in.
+TRACED, TRACED_WEIGHTS, WEIGHTS, WHOLE = "traced.onnx", "traced.weights", "weights", "whole.onnx"
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """Sizes to bake in; None leaves them to the user of the graph."""
+
+    views: int | None = None
+    size: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True)
+class Graphs:
+    """A frozen network: the whole and every stage as files in one folder, where all their weights are one more file."""
+
+    folder: Path
+    stages: list[Stage]
+    # Nodes of the whole.
+    nodes: int
+
+    @property
+    def whole(self) -> Path:
+        """The graph with the network's own outputs alone."""
+        return self.folder / WHOLE
+
+    @property
+    def bytes(self) -> int:
+        """How large the whole is with its weights."""
+        return self.whole.stat().st_size + (self.folder / WEIGHTS).stat().st_size
+
+    def of_stage(self, stage: Stage) -> Path:
+        """The graph between a stage's named tensors."""
+        return self.folder / f"stage.{stage.name}.onnx"
+
+
+def freeze(network: NamedTensors, description: Description, fixed: Fixed, folder: Path) -> Graphs:
+    """Trace a network and cut it into stages, all as files in an empty folder, checked against ONNX's specification."""
+    traced = trace(network, description, fixed, folder)
+    traced = in_precision(description.precision, traced, folder / WEIGHTS, _examples(description, fixed))
+    whole = _whole_graph(traced)
+    graphs = Graphs(folder, find_stages(traced, network.stages), len(whole.graph.node))
+    _write(whole, description, graphs.whole)
+    for stage in graphs.stages:
+        _write(stage_graph(traced, stage), description, graphs.of_stage(stage))
+    return graphs
+
+
+def _examples(description: Description, fixed: Fixed) -> Iterator[Feeds]:
+    """Noise and a room, upright and across, to see what ranges a network's numbers have."""
+    across = tuple(blocks * description.size_multiple for blocks in TRACE_BLOCKS)
+    for height, width in [fixed.size] if fixed.size else [across, across[::-1]]:
+        for make in (example_inputs, room_inputs):
+            inputs = make(fixed.views or TRACE_VIEWS, height, width, description.near, description.far)
+            yield {name: tensor.numpy() for name, tensor in inputs.items()}
+
+
+def trace(network: NamedTensors, description: Description, fixed: Fixed, folder: Path) -> onnx.ModelProto:
+    """Export the network with every stage boundary as an output; its weights go to a file in the folder.
+
+    torch.onnx's TorchScript path is used on purpose: with views, height and width dynamic, torch.export 2.13 spends
+    minutes reasoning about symbolic shapes even for a network of a tenth of the size. It is not given the weights,
+    of which it would hold several copies.
+    """
+    multiple = description.size_multiple
+    views = fixed.views or TRACE_VIEWS
+    height, width = fixed.size or (TRACE_BLOCKS[0] * multiple, TRACE_BLOCKS[1] * multiple)
+    inputs = tuple(example_inputs(views, height, width, description.near, description.far).values())
+    path, weights = folder / TRACED, folder / TRACED_WEIGHTS
+    with warnings.catch_warnings(), torch.no_grad(), in_steps(network):
+        warnings.simplefilter("ignore")  # deprecation of the path, and tracing warnings on sizes fixed on purpose
+        logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+        shapes = {name: tuple(tensor.shape) for name, tensor in network.named(*inputs).items()}
+        axes = _dynamic_axes(shapes, fixed)
+        torch.onnx.export(
+            network,
+            inputs,
+            str(path),
+            dynamo=False,
+            export_params=False,
+            do_constant_folding=False,  # weights that it folds lose their names; `simplify` folds them
+            opset_version=OPSET,
+            input_names=list(INPUTS),
+            output_names=list(shapes),
+            dynamic_axes=axes,
+        )
+    traced = explain(onnx.load(path))
+    fill_inputs(traced, [*network.named_parameters(), *network.named_buffers()], weights)
+    path.write_bytes(traced.SerializeToString())
+    model = simplify(path, folder / WEIGHTS)
+    weights.unlink()
+    _declare_shapes(model, shapes, axes)
+    return model
+
+
+def _dynamic_axes(shapes: dict[str, tuple[int, ...]], fixed: Fixed) -> dict[str, dict[int, str]]:
+    """Names of the dimensions that are not fixed; the maps between stages have dimensions of their own."""
+    boundaries = {
+        name: {0: "views", 2: f"{name}.height", 3: f"{name}.width"}
+        if len(shape) == 4
+        else {0: "views", 1: "neighbours"}
+        for name, shape in shapes.items()
+        if "." in name
+    }
+
+    def is_open(dimension: str) -> bool:
+        depends_on_views = dimension in ("views", "neighbours", "gaussians")
+        depends_on_size = dimension == "gaussians" or not depends_on_views
+        return (depends_on_views and not fixed.views) or (depends_on_size and not fixed.size)
+
+    axes = {**DYNAMIC, **boundaries}
+    return {name: {axis: dim for axis, dim in dims.items() if is_open(dim)} for name, dims in axes.items()}
+
+
+def _declare_shapes(
+    model: onnx.ModelProto, shapes: dict[str, tuple[int, ...]], axes: dict[str, dict[int, str]]
+) -> None:
+    """Give every output the shape that is known of it: the passes above replace names by ones of their own."""
+    for output in model.graph.output:
+        dims = [axes[output.name].get(axis, size) for axis, size in enumerate(shapes[output.name])]
+        element = output.type.tensor_type.elem_type
+        output.CopyFrom(onnx.helper.make_tensor_value_info(output.name, element, dims))
+
+
+def _whole_graph(traced: onnx.ModelProto) -> onnx.ModelProto:
+    model = copy.deepcopy(traced)
+    outputs = [output for output in model.graph.output if output.name in OUTPUTS]
+    del model.graph.output[:]
+    model.graph.output.extend(sorted(outputs, key=lambda output: OUTPUTS.index(output.name)))
+    return model
+
+
+def _write(model: onnx.ModelProto, description: Description, path: Path) -> None:
+    """Have a graph say what it is, and save it."""
+    model.ir_version = IR_VERSION
+    model.producer_name, model.producer_version = PRODUCER, description.version
+    model.doc_string = f"{description.preset} exported by idesplat {description.version}"
+    del model.metadata_props[:]
+    onnx.helper.set_model_props(model, {METADATA_KEY: description.to_json()})
+    path.write_bytes(model.SerializeToString())
+    onnx.checker.check_model(str(path), full_check=True)

@@ -1,0 +1,1 @@
+"""Editing of traced ONNX graphs."""

@@ -1,0 +1,1 @@
+"""Lower precisions: int8 and fp16."""

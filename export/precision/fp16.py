@@ -1,0 +1,39 @@
+"""Products of features in fp16, with casts around them, so that all else stays in float32.
+
+(The converter of onnxruntime.transformers rounds the graph's inputs, and cameras do not bear that.)
+"""
+
+import numpy as np
+import onnx
+
+from ..graph.nodes import replace_nodes
+
+
+def in_fp16(model: onnx.ModelProto, names: set[str]) -> onnx.ModelProto:
+    """The graph, loaded with its weights, where the nodes of these names are in fp16."""
+    weights = {tensor.name: tensor for tensor in model.graph.initializer}
+    nodes: list[onnx.NodeProto] = []
+    halved: dict[str, str] = {}  # tensors of which there is a copy in fp16
+    for node in model.graph.node:
+        if node.name not in names:
+            nodes.append(node)
+            continue
+        for index, name in enumerate(node.input):
+            if name not in halved:
+                halved[name] = f"{name}.half"
+                if name in weights:
+                    values = onnx.numpy_helper.to_array(weights[name]).astype(np.float16)
+                    model.graph.initializer.append(onnx.numpy_helper.from_array(values, halved[name]))
+                else:
+                    nodes.append(_cast(node, name, halved[name], onnx.TensorProto.FLOAT16))
+            node.input[index] = halved[name]
+        result = node.output[0]
+        node.output[0] = halved[result] = f"{result}.half"
+        nodes += [node, _cast(node, halved[result], result, onnx.TensorProto.FLOAT)]
+    replace_nodes(model.graph, nodes)
+    return model
+
+
+def _cast(node: onnx.NodeProto, given: str, result: str, element: int) -> onnx.NodeProto:
+    """A cast before or after a node, in the same part of the network."""
+    return onnx.helper.make_node("Cast", [given], [result], name=f"{node.name}/{result}", to=element)

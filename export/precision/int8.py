@@ -1,0 +1,235 @@
+"""Products of features in int8: transformers quantised as they run, convolutions by ranges found beforehand."""
+
+import logging
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+from onnxruntime.quantization import QuantType, quantize_dynamic
+
+from ...runtime.inference.session import open_session, run_session
+from ..graph.nodes import names_read, replace_nodes
+
+# Fewer products than this for an output are quicker in float32 than to quantise.
+FEW_TERMS = 64
+LARGEST_BYTE, LARGEST_WEIGHT, LARGEST_BIAS = 255, 127, 1 << 30
+SMALLEST_STEP = 1e-8  # of numbers that are all zero
+# ONNX Runtime convolves two to four times as fast where channels, in and out, are multiples of this.
+LANES = 4
+# Operators that move or repeat the numbers of their first input (all inputs: Concat), and compute nothing.
+MOVING = ("Concat", "Pad")
+
+Feeds = dict[str, np.ndarray]
+Ranges = dict[str, tuple[float, float]]
+
+
+def in_int8(
+    source: Path, graph: onnx.ModelProto, bearing: Iterable[onnx.NodeProto], examples: Iterable[Feeds]
+) -> onnx.ModelProto:
+    """The graph in the file `source`, where those of the nodes `bearing` it that have trained weights are in int8.
+
+    examples: inputs on which the ranges are found.
+    """
+    shapes = {tensor.name: tuple(tensor.dims) for tensor in graph.graph.initializer}
+    weighted = [node for node in bearing if node.input[1] in shapes]
+    convolutions = [
+        node for node in weighted if node.op_type == "Conv" and math.prod(shapes[node.input[1]][1:]) >= FEW_TERMS
+    ]
+    tensors = {name for node in convolutions for name in (node.input[0], node.output[0])}
+    ranges = _ranges(source, graph, sorted(tensors), examples)
+    dynamic = source.with_name("dynamic.onnx")
+    logging.disable(logging.WARNING)  # it advises to prepare the graph, which `simplify` has done
+    try:
+        quantize_dynamic(
+            source,
+            dynamic,
+            op_types_to_quantize=["MatMul"],
+            nodes_to_quantize=[node.name for node in weighted if node.op_type == "MatMul"],
+            weight_type=QuantType.QInt8,
+            use_external_data_format=True,
+            extra_options={"MatMulConstBOnly": True},
+        )
+    finally:
+        logging.disable(logging.NOTSET)
+    return _Convolutions(onnx.load(dynamic), {node.name for node in convolutions}, ranges).rounded()
+
+
+def _ranges(source: Path, graph: onnx.ModelProto, tensors: Iterable[str], examples: Iterable[Feeds]) -> Ranges:
+    """The least and the largest number of each of some tensors on the examples; zero is never outside."""
+    watched = onnx.ModelProto()
+    watched.CopyFrom(graph)
+    del watched.graph.output[:]
+    ranges = dict.fromkeys(tensors, (0.0, 0.0))
+    for name in ranges:
+        for bound in ("ReduceMin", "ReduceMax"):
+            watched.graph.node.append(onnx.helper.make_node(bound, [name], [f"{name}.{bound}"], keepdims=0))
+            watched.graph.output.append(onnx.ValueInfoProto(name=f"{name}.{bound}"))
+    path = source.with_name("watched.onnx")
+    path.write_bytes(watched.SerializeToString())
+    session = open_session(path)
+    for feeds in examples:
+        found = run_session(session, feeds)
+        for name, (low, high) in ranges.items():
+            bounds = float(found[f"{name}.ReduceMin"]), float(found[f"{name}.ReduceMax"])
+            ranges[name] = min(low, bounds[0]), max(high, bounds[1])
+    return ranges
+
+
+class _Convolutions:
+    """Rounds what convolutions read and yield to int8 and back, which a runtime makes int8 arithmetic of.
+
+    What only convolutions read is rounded before it is put together or its borders are repeated: integers are a
+    quarter of the bytes. (`quantize_static` of ONNX Runtime writes the same but for that, and searches the whole
+    graph at every step, for minutes.)
+    """
+
+    def __init__(self, model: onnx.ModelProto, names: set[str], ranges: Ranges) -> None:
+        self.model, self.names, self.ranges = model, names, ranges
+        self.weights = {tensor.name: tensor for tensor in model.graph.initializer}
+        self.nodes: list[onnx.NodeProto] = []
+        # Tensors rounded to the range of another: as integers, and as the numbers that these stand for.
+        self.integers: dict[tuple[str, str], str] = {}
+        self.numbers: dict[tuple[str, str], str] = {}
+        self.scales: dict[str, list[str]] = {}
+
+    def rounded(self) -> onnx.ModelProto:
+        """The model, with other nodes and weights."""
+        moved = self._moved()
+        for node in self.model.graph.node:
+            if node.name in self.names:
+                self._convolution(node)
+            elif node.output[0] in moved:
+                self._move(node, moved[node.output[0]])
+            else:
+                self.nodes.append(node)
+        replace_nodes(self.model.graph, self.nodes)
+        return self.model
+
+    def _moved(self) -> dict[str, str]:
+        """What is to be moved as integers, and the tensor that it becomes for convolutions, whose range it shares."""
+        readers: dict[str, list[onnx.NodeProto]] = {}
+        for node in self.model.graph.node:
+            for name in names_read(node):
+                readers.setdefault(name, []).append(node)
+        outputs = {output.name for output in self.model.graph.output}
+        moved: dict[str, str] = {}
+        for node in reversed(self.model.graph.node):
+            result = node.output[0]
+            if node.op_type in MOVING and result not in outputs:
+                becomes = {
+                    result if reader.name in self.names else moved.get(reader.output[0])
+                    for reader in readers.get(result, ())
+                }
+                if len(becomes) == 1 and (whose := becomes.pop()) is not None:
+                    moved[result] = whose
+        return moved
+
+    def _move(self, node: onnx.NodeProto, whose: str) -> None:
+        """Have a node move integers."""
+        result = node.output[0]
+        for index in range(len(node.input) if node.op_type == "Concat" else 1):
+            node.input[index] = self._integers(node.input[index], whose)
+        node.output[0] = self.integers[result, whose] = f"{result}.integers"
+        self.nodes.append(node)
+
+    def _convolution(self, node: onnx.NodeProto) -> None:
+        """Round what a convolution reads, its weights, and what it yields."""
+        given, result = node.input[0], node.output[0]
+        kernel, *bias = (onnx.numpy_helper.to_array(self.weights[name]) for name in node.input[1:])
+        outputs, inputs = kernel.shape[:2]
+        more_outputs = -outputs % LANES
+        more_inputs = 0 if kernel[0].size % LANES == 0 else -inputs % LANES
+        kernel = np.pad(kernel, [(0, more_outputs), (0, more_inputs), *[(0, 0)] * (kernel.ndim - 2)])
+        bias = [np.pad(values, (0, more_outputs)) for values in bias]
+        read = self._widened(given, more_inputs, kernel.ndim) if more_inputs else given
+        node.input[0] = self._numbers(read, given)
+        node.input[1:] = self._rounded_weights(node, [kernel, *bias], _step(self.ranges[given]))
+        node.output[0] = f"{result}.exact"
+        self.nodes.append(node)
+        integers = self._quantize(node.output[0], result)
+        if more_outputs:
+            integers = self._narrowed(integers, outputs)
+        self.integers[result, result] = integers
+        self.numbers[result, result] = self._dequantize(integers, result, result)
+
+    def _rounded_weights(self, node: onnx.NodeProto, weights: list[np.ndarray], step: np.float32) -> list[str]:
+        """The kernel and bias of a convolution whose input has this step, rounded."""
+        kernel, *bias = weights
+        channels = kernel.reshape(len(kernel), -1)
+        steps = np.maximum(np.abs(channels).max(axis=1) / LARGEST_WEIGHT, SMALLEST_STEP)
+        for values in bias:  # is in steps of the product
+            steps = np.maximum(steps, np.abs(values) / (LARGEST_BIAS * step))
+        steps = steps.astype(np.float32)
+        integers = [np.rint(channels / steps[:, None]).astype(np.int8).reshape(kernel.shape)]
+        integers += [np.rint(values / (steps * step)).astype(np.int32) for values in bias]
+        results = []
+        for name, values, scale in zip(node.input[1:], integers, (steps, steps * step), strict=False):
+            result = f"{node.name}/{name}.rounded"
+            parts = {"integers": values, "step": scale, "zero": np.zeros(len(scale), values.dtype)}
+            given = [self._constant(f"{result}.{part}", value) for part, value in parts.items()]
+            self._add("DequantizeLinear", given, result, axis=0)
+            results.append(result)
+        return results
+
+    def _widened(self, name: str, channels: int, axes: int) -> str:
+        """A tensor whose integers are those of another in its range, and so many channels of zeros."""
+        wide = f"{name}.wide"
+        if (wide, name) not in self.integers:
+            # Padding the one axis by its number is more than ONNX Runtime's optimiser bears.
+            pads = np.zeros((2, axes), np.int64)
+            pads[1, 1] = channels
+            given = [self._integers(name, name), self._constant(f"{wide}.pads", pads.ravel()), self._scale(name)[1]]
+            self.integers[wide, name] = self._add("Pad", given, f"{wide}.integers")
+        return wide
+
+    def _narrowed(self, name: str, channels: int) -> str:
+        """The first channels of a tensor."""
+        bounds = {"starts": 0, "ends": channels, "axes": 1}
+        given = [self._constant(f"{name}.{bound}", np.array([value], np.int64)) for bound, value in bounds.items()]
+        return self._add("Slice", [name, *given], f"{name}.narrow")
+
+    def _integers(self, name: str, whose: str) -> str:
+        """A tensor as integers in the range of another."""
+        if (name, whose) not in self.integers:
+            self.integers[name, whose] = self._quantize(name, whose)
+        return self.integers[name, whose]
+
+    def _numbers(self, name: str, whose: str) -> str:
+        """A tensor as the numbers that its integers stand for."""
+        if (name, whose) not in self.numbers:
+            self.numbers[name, whose] = self._dequantize(self._integers(name, whose), whose, f"{name}.rounded")
+        return self.numbers[name, whose]
+
+    def _quantize(self, name: str, whose: str) -> str:
+        """A tensor taken to integers in the range of another."""
+        return self._add("QuantizeLinear", [name, *self._scale(whose)], f"{name}.integers.{whose}")
+
+    def _dequantize(self, name: str, whose: str, result: str) -> str:
+        """Integers taken to the numbers that they stand for in a tensor's range."""
+        return self._add("DequantizeLinear", [name, *self._scale(whose)], result)
+
+    def _add(self, operator: str, given: list[str], result: str, **attributes: Any) -> str:
+        """Add a node, and name it after its result."""
+        self.nodes.append(onnx.helper.make_node(operator, given, [result], name=f"{result}/{operator}", **attributes))
+        return result
+
+    def _scale(self, whose: str) -> list[str]:
+        """The step and the zero of the integers that stand for a tensor's range."""
+        if whose not in self.scales:
+            step = _step(self.ranges[whose])
+            zero = np.uint8(np.clip(np.rint(-self.ranges[whose][0] / step), 0, LARGEST_BYTE))
+            self.scales[whose] = [self._constant(f"{whose}.step", step), self._constant(f"{whose}.zero", zero)]
+        return self.scales[whose]
+
+    def _constant(self, name: str, value: np.ndarray | np.generic) -> str:
+        """Add a constant."""
+        self.model.graph.initializer.append(onnx.numpy_helper.from_array(np.asarray(value), name))
+        return name
+
+
+def _step(bounds: tuple[float, float]) -> np.float32:
+    """The difference between neighbours among the 256 numbers that stand for a range."""
+    return np.float32(max((bounds[1] - bounds[0]) / LARGEST_BYTE, SMALLEST_STEP))

@@ -1,0 +1,71 @@
+"""Cases on which exported graphs are verified: a rendered room and noise, cameras and depth ranges that differ by view.
+
+A graph can be wrong for one kind of input alone: other numbers of views take another branch of `nearest_views`, square
+images hide exchanged axes, equal intrinsics hide a view that uses another's, and the trained depth range hides one
+that was baked in. Noise gives every part work to do; a rendered image has flat areas, edges and consistent geometry.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...runtime.inference.metadata import Description
+from ..freeze import Fixed
+from ..room import room_inputs, with_room
+from ..stages import NamedTensors, example_inputs
+
+# Where views are not fixed; more than `ORDERED_VIEWS` of model/common/geometry.py, and more than a view has neighbours.
+MOST_VIEWS_OF_A_CASE = 5
+# By how much the views' focal lengths, principal points and depth ranges differ.
+FOCAL_SPREAD, CENTRE_SPREAD, NEAR_SPREAD = 0.15, 0.04, 0.3
+NEARER = 0.8  # a near end over the trained one
+# Far over near, from the first view to the last: so little that the far end counts in inverse depths.
+LEAST_RANGE, LARGEST_RANGE = 3.0, 6.0
+
+
+@dataclass(frozen=True)
+class Case:
+    """What the network computes for some views: its inputs and all that its stages yield, by name."""
+
+    name: str
+    views: int
+    tensors: dict[str, np.ndarray]
+
+
+def verification_cases(network: NamedTensors, description: Description, fixed: Fixed) -> Iterator[Case]:
+    """Cases of different numbers of views, sizes and contents, as far as views and size are not fixed."""
+    near, far, block = description.near, description.far, description.size_multiple
+    trained = fixed.size or (description.height, description.width)
+    across, upright = (fixed.size or (rows * block, columns * block) for rows, columns in ((6, 8), (8, 6)))
+    room = room_inputs(fixed.views or 2, *trained, near, far)
+    yield _case(network, "room", room)
+    noise = example_inputs(fixed.views or MOST_VIEWS_OF_A_CASE, *across, near, far)
+    yield _case(network, "noise", different_cameras(noise))
+    nearer = NEARER * near
+    cameras = different_cameras(example_inputs(fixed.views or 3, *upright, nearer, far))
+    yield _case(network, "room", with_room(cameras, nearer))
+
+
+def different_cameras(inputs: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The same inputs with intrinsics and a depth range of each view's own."""
+    views = len(inputs["images"])
+    spread = torch.linspace(-1, 1, views)
+    intrinsics = inputs["intrinsics"].clone()
+    intrinsics[:, 0, 0] *= 1 + FOCAL_SPREAD * spread
+    intrinsics[:, 1, 1] *= 1 + FOCAL_SPREAD * spread.flip(0)
+    intrinsics[:, 0, 2] += CENTRE_SPREAD * spread
+    intrinsics[:, 1, 2] -= CENTRE_SPREAD * spread
+    near = inputs["near"] * (1 + NEAR_SPREAD * torch.linspace(0, 1, views))
+    far = near * torch.linspace(LEAST_RANGE, LARGEST_RANGE, views)
+    return inputs | {"intrinsics": intrinsics, "near": near, "far": far}
+
+
+def _case(network: NamedTensors, content: str, inputs: dict[str, Tensor]) -> Case:
+    with torch.no_grad():
+        tensors = {**inputs, **network.named(*inputs.values())}
+    views, _, height, width = inputs["images"].shape
+    name = f"{content}, {views} views {height}x{width}"
+    return Case(name, views, {name: value.numpy() for name, value in tensors.items()})

@@ -1,0 +1,1 @@
+"""What the networks share: layers, features, geometry, and the Gaussian adapter."""

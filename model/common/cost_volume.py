@@ -1,0 +1,80 @@
+"""How well each pixel matches its neighbours at each candidate depth, by bilinear warping (plane sweep).
+
+Two forms of the same sums. PyTorch has an operator that samples features, which are then scored. In ONNX it is called
+GridSample, slow on CPUs and missing elsewhere. Interpolation and inner product commute, so a graph scores whole pixels
+first and interpolates between four scores.
+"""
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from .gather_attention import SparseProducts
+from .geometry import Cameras, sampling_points, scale_intrinsics
+from .layers import fixed, repeat_views, to_tokens
+
+CORNERS = 4  # pixels around a point
+
+
+def cost_volume(
+    features: Tensor, candidates: Tensor, cameras: Cameras, neighbours: Tensor, products: SparseProducts
+) -> Tensor:
+    """Correlation of features [views, channels, h, w] with those of the neighbours, warped: [views, candidates, h, w].
+
+    candidates: inverse depths [views, candidates, h, w]. neighbours: [views, n]; their costs are averaged.
+    Each view projects with its own intrinsics; the release projects into a neighbour with those of the view that looks,
+    which are the same in all that it was trained on.
+    """
+    views, _, height, width = features.shape
+    channels, count = fixed(features.shape[1]), fixed(candidates.shape[1])
+    intrinsics = scale_intrinsics(cameras.intrinsics, height, width)
+    x, y = sampling_points(candidates, intrinsics, cameras.extrinsics, neighbours)
+    if torch.onnx.is_in_onnx_export():
+        scores = by_gathering(features, neighbours, x, y, products)
+    else:
+        scores = by_sampling(features, neighbours, x, y)
+    scores = scores * channels**-0.5
+    return scores.reshape(views, -1, count, height * width).mean(1).reshape(-1, count, height, width)
+
+
+def by_sampling(features: Tensor, neighbours: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Scores of every pixel with its neighbours' features at x and y, [pairs, candidates, h * w] like x and y."""
+    height, width = features.shape[2:]
+    grid = torch.stack([2 * x / (width - 1) - 1, 2 * y / (height - 1) - 1], dim=-1)
+    warped = F.grid_sample(features[neighbours].flatten(0, 1), grid, align_corners=True)
+    own = repeat_views(features.flatten(2), neighbours.shape[1])[:, :, None]  # [pairs, channels, 1, h * w]
+    return (warped * own).sum(1)
+
+
+def by_gathering(features: Tensor, neighbours: Tensor, x: Tensor, y: Tensor, products: SparseProducts) -> Tensor:
+    """The same by gathering the features of the four pixels around each candidate."""
+    own = repeat_views(to_tokens(features), neighbours.shape[1])  # [pairs, h * w, channels]
+    table = to_tokens(bordered(features))  # [views, bordered pixels, channels]
+    first = (neighbours.flatten() * table.shape[1]).to(torch.int32)[:, None, None]
+    corners, across, down = corners_around(x, y, *features.shape[2:])
+    rows = torch.cat([first + corner for corner in corners], dim=1)  # [pairs, 4 * candidates, h * w]
+    scores = products.correlate(own, table.flatten(0, 1), rows)
+    return interpolate(scores.split(fixed(x.shape[1]), dim=1), across, down)
+
+
+def bordered(features: Tensor) -> Tensor:
+    """Maps [n, channels, h, w] with a border of zeros, which is what lies outside."""
+    return F.pad(features, (1, 1, 1, 1))
+
+
+def corners_around(x: Tensor, y: Tensor, height: int, width: int) -> tuple[list[Tensor], Tensor, Tensor]:
+    """The four pixels around x and y as indices of a bordered map, upper ones first, and the way from left and top."""
+    left, top = x.floor().clamp(max=width - 1), y.floor().clamp(max=height - 1)
+    row = width + 2
+    upper_left = ((top + 1) * row + left + 1).to(torch.int32)
+    return [upper_left, upper_left + 1, upper_left + row, upper_left + row + 1], x - left, y - top
+
+
+def interpolate(around: Sequence[Tensor], across: Tensor, down: Tensor) -> Tensor:
+    """Bilinear interpolation between what `corners_around` orders."""
+    upper_left, upper_right, lower_left, lower_right = around
+    upper = upper_left + across * (upper_right - upper_left)
+    lower = lower_left + across * (lower_right - lower_left)
+    return upper + down * (lower - upper)

@@ -1,0 +1,1 @@
+"""DepthSplat: its depth stage, its Gaussian regressor and the network."""

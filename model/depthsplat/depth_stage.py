@@ -1,0 +1,127 @@
+"""DepthSplat's depth, one scale after the other: a cost volume, its regularisation, and the expected inverse depth."""
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ..common.cost_volume import CORNERS, cost_volume
+from ..common.encoder import EncodedPyramid
+from ..common.gather_attention import SparseProducts
+from ..common.geometry import Cameras
+from ..common.layers import Upsample2x, resize, softmax
+from ..common.unet import CostRegulariser
+from ..config import DepthSplatConfig
+from .upsampler import DepthUpsampler
+
+
+class Matched(NamedTuple):
+    """What a scale yields."""
+
+    features_mv: Tensor  # [views, channels, h, w], the matching features at its resolution
+    inverse_depth: Tensor  # [views, 1, h, w]
+    probability: Tensor  # [views, candidates, h, w]
+    # At image size: bilinear and, at the last scale, corrected by the learned upsampler: [views, 1, H, W].
+    inverse_depth_full: Tensor
+
+
+class PredictedDepth(NamedTuple):
+    """The result of the network that has no Gaussians, and the scale that it comes from."""
+
+    depth: Tensor  # [views, H, W], metric z-depth
+    scale: Matched
+
+
+class DepthStage(nn.Module):
+    """The part that both scales share."""
+
+    def __init__(self, config: DepthSplatConfig, scale: int) -> None:
+        super().__init__()
+        unet = config.scales[scale].unet
+        self.candidates = config.scales[scale].candidates
+        self.stride = config.feature_stride // 2**scale
+        cnn = (config.feature_channels, config.backbone_channels[1])[scale]
+        matching = config.feature_channels // 2**scale
+        self.products = SparseProducts(CORNERS * self.candidates * matching, config.smallest_map(2**scale))
+        inputs = self.candidates + cnn + matching + config.vit.dim // 2**scale
+        self.regulariser = CostRegulariser(inputs, unet.channels, unet)
+        self.shortcut = nn.Conv2d(inputs, unet.channels, 1)
+        self.head1 = nn.Conv2d(unet.channels, 2 * unet.channels, 3, padding=1, padding_mode="replicate")
+        self.head2 = nn.Conv2d(2 * unet.channels, self.candidates, 3, padding=1, padding_mode="replicate")
+        self.upsampler = DepthUpsampler(config) if scale == len(config.scales) - 1 else None
+
+    def match(
+        self, cnn: Tensor, mv: Tensor, mono: Tensor, candidates: Tensor, cameras: Cameras, neighbours: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Three maps [views, channels, h, w] and candidate inverse depths -> inverse depth and probability."""
+        costs = cost_volume(mv, candidates, cameras, neighbours, self.products)
+        known = torch.cat([costs, cnn, mv, mono], dim=1)
+        regular = self.regulariser.scores(known, known.shape[0]) + self.shortcut(known)
+        probability = softmax(self.head2(F.gelu(self.head1(regular))), dim=1)
+        return (probability * candidates).sum(1, keepdim=True), probability
+
+    def at_image_size(
+        self, inverse_depth: Tensor, encoded: EncodedPyramid, features_mv: list[Tensor], cameras: Cameras
+    ) -> Tensor:
+        """Inverse depth [views, 1, h, w] -> [views, 1, H, W]."""
+        height, width = inverse_depth.shape[2:]
+        full = resize(inverse_depth, height * self.stride, width * self.stride)
+        if self.upsampler is None:
+            return full
+        farthest, nearest = cameras.inverse_range()
+        residual = self.upsampler(encoded, [*features_mv, inverse_depth])
+        return torch.minimum(torch.maximum(full + residual, farthest), nearest)
+
+
+class CoarseDepth(DepthStage):
+    """The first scale: it searches the whole range."""
+
+    def __init__(self, config: DepthSplatConfig) -> None:
+        super().__init__(config, scale=0)
+
+    def forward(self, encoded: EncodedPyramid, cameras: Cameras) -> Matched:
+        """Encoded views -> inverse depth at the encoder's resolution."""
+        mv = encoded.features_mv
+        farthest, nearest = cameras.inverse_range()
+        steps = torch.linspace(0, 1, self.candidates, dtype=mv.dtype, device=mv.device)[None, :, None, None]
+        candidates = (farthest + steps * (nearest - farthest)).expand(-1, -1, *mv.shape[2:])
+        inverse_depth, probability = self.match(
+            encoded.features_cnn, mv, encoded.features_mono, candidates, cameras, encoded.neighbours
+        )
+        full = self.at_image_size(inverse_depth, encoded, [mv], cameras)
+        return Matched(mv, inverse_depth, probability, full)
+
+
+class FineDepth(DepthStage):
+    """The second scale: twice the resolution, candidates around the inverse depth of the first."""
+
+    def __init__(self, config: DepthSplatConfig) -> None:
+        super().__init__(config, scale=1)
+        # The first scale's intervals, and twice as many since this scale's are half as wide.
+        self.intervals = 2 * (config.scales[0].candidates - 1)
+        self.grow_mv = Upsample2x(config.feature_channels)
+        self.grow_mono = Upsample2x(config.vit.dim)
+
+    def forward(self, encoded: EncodedPyramid, before: Matched, cameras: Cameras) -> Matched:
+        """Encoded views and the first scale -> inverse depth at twice its resolution."""
+        mv = self.grow_mv(encoded.features_mv)
+        # As in the releases, this scale learns nothing through where the one before made it search.
+        seed = resize(before.inverse_depth, *mv.shape[2:]).detach()
+        candidates = self.candidates_around(seed, cameras)
+        mono = self.grow_mono(encoded.features_mono)
+        inverse_depth, probability = self.match(
+            encoded.features_cnn_fine, mv, mono, candidates, cameras, encoded.neighbours
+        )
+        full = self.at_image_size(inverse_depth, encoded, [encoded.features_mv, mv], cameras)
+        return Matched(mv, inverse_depth, probability, full)
+
+    def candidates_around(self, seed: Tensor, cameras: Cameras) -> Tensor:
+        """Candidates [views, candidates, h, w], evenly spaced around the seed within the cameras' range."""
+        farthest, nearest = cameras.inverse_range()
+        interval = (nearest - farthest) / self.intervals
+        half = self.candidates // 2
+        low = torch.maximum(seed - interval * half, farthest)
+        high = torch.minimum(seed + interval * (half - 1), nearest)
+        steps = torch.linspace(0, 1, self.candidates, dtype=seed.dtype, device=seed.device)[None, :, None, None]
+        return low + steps * (high - low)

@@ -1,0 +1,89 @@
+"""DepthSplat: posed photographs to depth and Gaussians in one pass.
+
+Read beside `idesplat.py`. What the two share is written once: CNN, multi-view transformer and ViT (encoder.py), the
+U-Net that regularises costs (unet.py), dense prediction (dpt.py), and Gaussians from depth and raw parameters
+(gaussian_adapter.py). They part where depth is found, here by sweeping planes at one scale or two (depth_stage.py),
+there by attention along epipolar lines, three times over (dpbu.py); and where it is brought to image size, here by DPT
+heads (upsampler.py, gaussian_regressor.py), there by window attention over shuffled pixels (gaussian_head.py).
+"""
+
+from torch import Tensor, nn
+
+from ..common.encoder import EncodedPyramid, PyramidEncoder
+from ..common.geometry import Cameras
+from ..config import DepthSplatConfig
+from ..idesplat.gaussian_head import Predicted
+from .depth_stage import CoarseDepth, FineDepth, Matched, PredictedDepth
+from .gaussian_regressor import GaussianRegressor
+
+
+class DepthScales(nn.Module):
+    """The stages up to the depth, with one scale or two."""
+
+    def __init__(self, config: DepthSplatConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.encoder = PyramidEncoder(config)
+        if len(config.scales) == 1:
+            self.depth = CoarseDepth(config)
+        else:
+            self.depth1 = CoarseDepth(config)
+            self.depth2 = FineDepth(config)
+
+    def depth_stages(self, images: Tensor, cameras: Cameras) -> tuple[EncodedPyramid, tuple[Matched, ...]]:
+        """The encoded views and what each scale yields, coarsest first."""
+        encoded = self.encoder(images, cameras.extrinsics)
+        if len(self.config.scales) == 1:
+            return encoded, (self.depth(encoded, cameras),)
+        first = self.depth1(encoded, cameras)
+        return encoded, (first, self.depth2(encoded, first, cameras))
+
+
+class DepthSplat(DepthScales):
+    """The whole network; its parts are the stages that export, manifest and parity report name.
+
+    images ── encoder ── depth1 ── depth2 ── gaussians ── depth, means, scales, quats, opacities, sh
+                 │  1/stride │  2/stride │     │
+                 └───────────┴───────────┴─────┘ features of CNN, multi-view transformer, ViT
+
+    With one scale, `depth` stands in the place of `depth1` and `depth2`.
+    """
+
+    def __init__(self, config: DepthSplatConfig) -> None:
+        super().__init__(config)
+        self.gaussians = GaussianRegressor(config)
+
+    def forward(self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor, near: Tensor, far: Tensor) -> Predicted:
+        """Predict depth and Gaussians.
+
+        images: [views, 3, H, W], RGB in [0, 1]; H and W multiples of `config.size_multiple`, two views or more.
+        extrinsics: [views, 4, 4], camera-to-world, OpenCV axes.
+        intrinsics: [views, 3, 3], normalised by width and height.
+        near, far: [views], in scene units.
+        """
+        return self.stages(images, extrinsics, intrinsics, near, far)[-1]
+
+    def stages(
+        self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor, near: Tensor, far: Tensor
+    ) -> tuple[EncodedPyramid, *tuple[Matched, ...], Predicted]:
+        """What each stage yields, in order, for parity and for training with every stage supervised."""
+        cameras = Cameras(extrinsics, intrinsics, near, far)
+        encoded, scales = self.depth_stages(images, cameras)
+        return encoded, *scales, self.gaussians(images, cameras, encoded, scales)
+
+
+class DepthSplatDepth(DepthScales):
+    """DepthSplat without Gaussians, as the depth-only checkpoints have it: the last scale's depth is the result."""
+
+    def forward(
+        self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor, near: Tensor, far: Tensor
+    ) -> PredictedDepth:
+        """Predict depth; arguments as for `DepthSplat`."""
+        return self.stages(images, extrinsics, intrinsics, near, far)[-1]
+
+    def stages(
+        self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor, near: Tensor, far: Tensor
+    ) -> tuple[EncodedPyramid, *tuple[Matched, ...], PredictedDepth]:
+        """What each stage yields, in order, for parity and for training with every stage supervised."""
+        encoded, (*before, last) = self.depth_stages(images, Cameras(extrinsics, intrinsics, near, far))
+        return encoded, *before, PredictedDepth(1 / last.inverse_depth_full[:, 0], last)

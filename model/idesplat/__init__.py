@@ -1,0 +1,1 @@
+"""IDESplat: depth probability boosting, the Gaussian focused module and the network."""

@@ -1,0 +1,113 @@
+"""A depth probability boosting unit: two epipolar attention layers whose probabilities multiply (IDESplat, section 2).
+
+Three of them run from coarse to fine, each in a narrower range around the inverse depth of the one before.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ..common.encoder import Encoded
+from ..common.geometry import Cameras, nearest_pixels, scale_intrinsics
+from ..common.layers import Merge, Upsample2x, fixed, resize
+from ..config import DPBUConfig, IDESplatConfig
+from .epipolar_attention import EpipolarAttention
+
+
+class Boosted(NamedTuple):
+    """What a unit hands to the next."""
+
+    features: Tensor  # [views, channels, h, w] after the attention
+    context: Tensor  # [views, context channels, h, w] before it, refined along from unit to unit
+    inverse_depth_first: Tensor  # [views, 1, h, w] after the first layer alone
+    inverse_depth: Tensor  # [views, 1, h, w]
+    probability: Tensor  # [views, candidates, h, w], mean over the neighbours
+    candidates: Tensor  # [views, candidates, h, w] inverse depths
+
+
+class DepthProbabilityBoostingUnit(nn.Module):
+    """The part that all three units share."""
+
+    def __init__(self, config: IDESplatConfig, unit: DPBUConfig) -> None:
+        super().__init__()
+        self.candidates = unit.candidates
+        self.first = EpipolarAttention(config, unit)
+        self.second = EpipolarAttention(config, unit)
+
+    def boost(
+        self, features: Tensor, context: Tensor, seed: Tensor, candidates: Tensor, neighbours: Tensor, cameras: Cameras
+    ) -> Boosted:
+        """Run two layers over the same warp indices, starting from `features` and the inverse depth `seed`."""
+        height, width = features.shape[2:]
+        pixels = scale_intrinsics(cameras.intrinsics, height, width)
+        rows = nearest_pixels(candidates, pixels, cameras.extrinsics, neighbours)
+        features, prior = self.first(features, seed, rows, None)
+        first_depth, _ = expectation(prior, candidates)
+        features, posterior = self.second(features, first_depth, rows, prior)
+        inverse_depth, probability = expectation(posterior, candidates)
+        return Boosted(features, context, first_depth, inverse_depth, probability, candidates)
+
+
+class CoarseUnit(DepthProbabilityBoostingUnit):
+    """The first unit: it searches the whole range, and starts from the encoder's features and monocular disparity."""
+
+    def __init__(self, config: IDESplatConfig, unit: DPBUConfig) -> None:
+        super().__init__(config, unit)
+        parts = (config.feature_channels, config.feature_channels, *config.mono_channels)
+        self.merge = Merge(parts, unit.channels)
+
+    def forward(self, encoded: Encoded, cameras: Cameras) -> Boosted:
+        """Encoded views -> features and inverse depth at the encoder's resolution."""
+        size = encoded.features_cnn.shape[2:]
+        at_size = [encoded.features_cnn, encoded.features_mv, encoded.features_mono]
+        context = self.merge(at_size, [encoded.mono_out], *size)
+        farthest, nearest = cameras.inverse_range()
+        steps = torch.linspace(0, 1, self.candidates, dtype=context.dtype, device=context.device)[None, :, None, None]
+        candidates = (farthest + steps * (nearest - farthest)).expand(-1, -1, *size)
+        return self.boost(context, context, encoded.mono_disparity, candidates, encoded.neighbours, cameras)
+
+
+class FinerUnit(DepthProbabilityBoostingUnit):
+    """The second or third unit: twice the resolution, candidates around the inverse depth of the unit before."""
+
+    def __init__(self, config: IDESplatConfig, unit: DPBUConfig, before: DPBUConfig, context: int) -> None:
+        """`before` is the previous unit, `context` the channels of its context."""
+        super().__init__(config, unit)
+        # The coarse unit's intervals, and by how much this unit's are narrower.
+        self.intervals = (config.dpbus[0].candidates - 1) * unit.scale
+        self.grow_features = Upsample2x(before.channels)
+        self.grow_context = Upsample2x(context)
+        # The CNN has a map of the second unit's resolution itself; only the third must grow it.
+        cnn = config.backbone_channels[1]
+        self.grow_cnn = Upsample2x(cnn) if unit.scale > 2 else nn.Identity()
+        cnn = cnn // 2 if unit.scale > 2 else cnn
+        self.merge = Merge((before.channels // 2, context // 2, cnn, *config.mono_channels), unit.channels)
+
+    def forward(self, encoded: Encoded, before: Boosted, cameras: Cameras) -> Boosted:
+        """Encoded views and the unit before -> features and inverse depth at twice its resolution."""
+        context = self.grow_context(before.context)
+        size = context.shape[2:]
+        at_size = [self.grow_features(before.features), context, self.grow_cnn(encoded.features_cnn_fine)]
+        features = self.merge(at_size, [encoded.features_mono, encoded.mono_out], *size)
+        seed = resize(before.inverse_depth, *size)
+        candidates = self.candidates_around(seed, cameras)
+        return self.boost(features, context, seed, candidates, encoded.neighbours, cameras)
+
+    def candidates_around(self, seed: Tensor, cameras: Cameras) -> Tensor:
+        """Candidates [views, candidates, h, w], evenly spaced around the seed within the cameras' range."""
+        farthest, nearest = cameras.inverse_range()
+        half = (self.candidates - 1) / 2
+        reach = (nearest - farthest) / self.intervals * half
+        low = torch.maximum(seed - reach, farthest)
+        high = torch.minimum(seed + reach, nearest)
+        steps = torch.linspace(-half, half, self.candidates, dtype=seed.dtype, device=seed.device)[None, :, None, None]
+        return (low + high) / 2 + steps * ((high - low) / (self.candidates - 1))
+
+
+def expectation(probability: Tensor, candidates: Tensor) -> tuple[Tensor, Tensor]:
+    """Probabilities [pairs, candidates, h * w] -> expected inverse depth and probabilities, by view as maps."""
+    views, _, height, width = candidates.shape
+    count = fixed(candidates.shape[1])
+    probability = probability.reshape(views, -1, count, height * width).mean(1).reshape(-1, count, height, width)
+    return (probability * candidates).sum(1, keepdim=True), probability

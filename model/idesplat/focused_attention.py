@@ -1,0 +1,120 @@
+"""The Gaussian focused module: window attention whose layers keep ever fewer neighbours of each pixel."""
+
+import torch
+from torch import Tensor, nn
+
+from ..common.layers import ConvFFN, DepthwiseConv, to_map, to_tokens
+from ..common.windows import join_windows, region_mask, split_windows
+from ..config import FocusConfig
+
+EPSILON = 1e-10
+
+
+class GaussianFocusedModule(nn.Module):
+    """Layers of plain and shifted windows in turn; each kind hands its attention to the next of its kind."""
+
+    def __init__(self, config: FocusConfig, ffn_ratio: int, ffn_kernel: int) -> None:
+        super().__init__()
+        self.window = config.window
+        self.layers = nn.ModuleList(
+            FocusedLayer(config, index, ffn_ratio, ffn_kernel) for index in range(len(config.topk))
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[views, channels, h, w] -> the same shape; h and w are padded to windows by reflection and cut again."""
+        height, width = x.shape[2:]
+        window = self.window
+        padded_height = (height + window - 1) // window * window
+        padded_width = (width + window - 1) // window * window
+        x = torch.cat([x, x.flip(2)], dim=2)[:, :, :padded_height]
+        x = torch.cat([x, x.flip(3)], dim=3)[:, :, :, :padded_width]
+        mask = region_mask(padded_height, padded_width, window, window, x)
+        attention: list[Tensor | None] = [None, None]
+        for index, layer in enumerate(self.layers):
+            x, attention[index % 2] = layer(x, attention[index % 2], mask)
+        return x[:, :, :height, :width]
+
+
+class FocusedLayer(nn.Module):
+    """One layer: window attention times the attention of the layer two before, then a feed-forward network.
+
+    The releases gather the kept neighbours and multiply sparsely. Windows are small, so here the attention stays
+    dense, with zeros where a neighbour has been dropped: the same sums without a custom kernel.
+    """
+
+    position_index: Tensor
+
+    def __init__(self, config: FocusConfig, index: int, ffn_ratio: int, ffn_kernel: int) -> None:
+        super().__init__()
+        channels, self.window, self.heads = config.channels, config.window, config.heads
+        self.head_channels = channels // self.heads
+        tokens = self.window**2
+        self.shifted = index % 2 == 1
+        self.topk = config.topk[index]
+        self.drops = self.topk < (config.topk[index - 2] if index >= 2 else tokens)
+        # Whether the layer before of the same kind has dropped neighbours already.
+        self.narrowed = index >= 2 and config.topk[index - 2] < tokens
+        self.norm1 = nn.LayerNorm(channels)
+        self.q_proj = nn.Linear(channels, channels)
+        self.k_proj = nn.Linear(channels, channels)
+        self.v_proj = nn.Linear(channels, channels)
+        self.v_depthwise = DepthwiseConv(channels, ffn_kernel)
+        self.position_bias = nn.Parameter(torch.zeros((2 * self.window - 1) ** 2, self.heads))
+        nn.init.trunc_normal_(self.position_bias, std=0.02)
+        self.register_buffer("position_index", relative_position_index(self.window), persistent=False)
+        self.proj = nn.Linear(channels, channels)
+        self.norm2 = nn.LayerNorm(channels)
+        self.ffn = ConvFFN(channels, ffn_ratio, ffn_kernel)
+
+    def forward(self, x: Tensor, before: Tensor | None, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """x [views, channels, h, w], before [views, windows, heads, tokens, tokens] or None -> x and this attention."""
+        height, width = x.shape[2:]
+        tokens = to_tokens(x)
+        normed = self.norm1(tokens)
+        value = self.v_proj(normed)
+        parts = [self.q_proj(normed), self.k_proj(normed), value, self.v_depthwise(value, height, width)]
+        q, k, v, local = (self._split(part, height, width) for part in parts)
+        attention = self._attend(q, k, before, mask)
+        tokens = tokens + self.proj(self._join(attention @ v + local, height, width))
+        tokens = tokens + self.ffn(self.norm2(tokens), height, width)
+        return to_map(tokens, height, width), attention
+
+    def _attend(self, q: Tensor, k: Tensor, before: Tensor | None, mask: Tensor) -> Tensor:
+        """Attention over the neighbours that are left, the `topk` strongest kept."""
+        scores = (q * self.head_channels**-0.5) @ k.transpose(-1, -2)  # [views, windows, heads, tokens, tokens]
+        scores = scores + self.position_bias[self.position_index].permute(2, 0, 1)
+        if before is not None and self.narrowed:
+            # The releases leave the mask away from here on: what it hid has all but zero weight in `before`.
+            scores = torch.where(before > 0, scores, -torch.inf)
+        elif self.shifted:
+            scores = scores + mask[:, None]
+        attention = scores.softmax(-1)
+        if before is not None:
+            product = attention * before + EPSILON
+            if self.narrowed:
+                product = torch.where(before > 0, product, 0.0)
+            attention = product / (product.sum(-1, keepdim=True) + EPSILON)
+        if self.drops:
+            # The least of the strongest is found in half the time where they need not be in order.
+            weakest = attention.topk(self.topk, dim=-1, sorted=False).values.amin(-1, keepdim=True)
+            attention = torch.where(attention >= weakest, attention, 0.0)
+        return attention
+
+    def _split(self, tokens: Tensor, height: int, width: int) -> Tensor:
+        """[views, h * w, channels] -> [views, windows, heads, tokens, channels / heads], shifted in odd layers."""
+        image = tokens.reshape(-1, height, width, self.heads * self.head_channels)
+        windows = split_windows(image, self.window, self.window, self.shifted)
+        return windows.reshape(tokens.shape[0], -1, self.window**2, self.heads, self.head_channels).transpose(2, 3)
+
+    def _join(self, windows: Tensor, height: int, width: int) -> Tensor:
+        """The inverse of `_split`."""
+        windows = windows.transpose(2, 3).reshape(-1, self.window**2, self.heads * self.head_channels)
+        image = join_windows(windows, height, width, self.window, self.window, self.shifted)
+        return image.reshape(-1, height * width, self.heads * self.head_channels)
+
+
+def relative_position_index(window: int) -> Tensor:
+    """Row of the position bias table for each pair of a window's tokens, [tokens, tokens] (Swin)."""
+    steps = torch.arange(window)
+    y, x = steps.repeat_interleave(window), steps.repeat(window)
+    return (y[:, None] - y + window - 1) * (2 * window - 1) + (x[:, None] - x + window - 1)

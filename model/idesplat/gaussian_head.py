@@ -1,0 +1,130 @@
+"""The last stage: depth refined once more and fused, and each pixel's raw Gaussian parameters and Gaussian."""
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ..common.encoder import Encoded, normalise
+from ..common.gaussian_adapter import BASE_PARAMETERS, GaussianAdapter, WorldGaussians
+from ..common.geometry import Cameras
+from ..common.layers import resize
+from ..common.unet import CostRegulariser
+from ..config import IDESplatConfig
+from .cross_view import CHANNELS, cross_view_features
+from .dpbu import Boosted
+from .focused_attention import GaussianFocusedModule
+
+# Shares of the three units' and the residual head's inverse depth in the final one (mv_unimatch.py).
+DEPTH_SHARES = (0.1, 0.1, 0.4, 0.4)
+# Pixels of a block that become channels, a side.
+SHUFFLE = 4
+# conv_image's channels are the feature channels over this.
+IMAGE_SHARE = 16
+
+
+class Predicted(NamedTuple):
+    """The network's result, and the two maps before it that parity looks at."""
+
+    depth: Tensor  # [views, H, W], metric z-depth
+    gaussians: WorldGaussians
+    features: Tensor  # [views, feature channels, H, W]
+    raw: Tensor  # [views, parameters, H, W]
+
+
+class HeadInputs(NamedTuple):
+    """What the Gaussian head reads of the stages before it; h and w are the image's size over the feature stride."""
+
+    inverse_depth: Tensor  # [views, 1, H, W], the final one
+    features_cnn: Tensor  # [views, feature channels, h, w]
+    context: Tensor  # [views, channels, h, w] of the first DPBU
+    features_last: Tensor  # [views, channels, 4h, 4w] of the third DPBU
+    neighbours: Tensor  # [views, n]
+
+
+class CrossViewHead(nn.Module):
+    """What other views show at a pixel's place, to a change of its raw parameters; at first there is none."""
+
+    def __init__(self, channels: int, parameters: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(CHANNELS, channels, 3, padding=1)
+        self.conv2 = nn.Conv2d(channels, parameters, 3, padding=1)
+        nn.init.zeros_(self.conv2.weight)
+        nn.init.zeros_(self.conv2.bias)  # type: ignore[arg-type]
+
+    def forward(self, images: Tensor, cameras: Cameras, inputs: HeadInputs) -> Tensor:
+        """Images [views, 3, H, W] in [0, 1] -> [views, parameters, H, W]."""
+        compared = cross_view_features(images, inputs.inverse_depth, cameras, inputs.neighbours)
+        return self.conv2(F.gelu(self.conv1(compared)))
+
+
+class GaussianStage(nn.Module):
+    """Residual depth head, depth fusion, Gaussian focused module, Gaussian head and adapter."""
+
+    def __init__(self, config: IDESplatConfig) -> None:
+        super().__init__()
+        last, channels = config.dpbus[2], config.feature_channels
+        self.residual = CostRegulariser(last.channels + last.candidates + 1, last.candidates, config.residual_unet)
+        block = SHUFFLE**2
+        image_channels = channels // IMAGE_SHARE
+        fused = (image_channels + last.channels + 1) * block + channels + config.dpbus[0].channels
+        self.conv_image = nn.Conv2d(3, image_channels, 1)
+        self.fuse = nn.Conv2d(fused, config.focus.channels, 1)
+        self.focus = GaussianFocusedModule(config.focus, config.ffn_ratio, config.ffn_kernel)
+        self.expand = nn.Conv2d(config.focus.channels, block * channels, 1)
+        parameters = BASE_PARAMETERS + 3 * config.sh_coefficients
+        self.head1 = nn.Conv2d(channels, parameters, 3, padding=1, padding_mode="replicate")
+        self.head2 = nn.Conv2d(parameters, parameters, 3, padding=1, padding_mode="replicate")
+        self.cross_view = CrossViewHead(config.cross_view_channels, parameters) if config.cross_view_channels else None
+        self.adapter = GaussianAdapter(config)
+
+    def forward(
+        self, images: Tensor, cameras: Cameras, encoded: Encoded, units: tuple[Boosted, Boosted, Boosted]
+    ) -> Predicted:
+        """Images [views, 3, H, W] in [0, 1] and all that is known of them -> depth and Gaussians."""
+        return self.predict(images, cameras, self.head_inputs(images, cameras, encoded, units))
+
+    def head_inputs(
+        self, images: Tensor, cameras: Cameras, encoded: Encoded, units: tuple[Boosted, Boosted, Boosted]
+    ) -> HeadInputs:
+        """Everything up to the final inverse depth; none of it changes while the Gaussian head alone is trained."""
+        inverse_depth = self.fused_inverse_depth(units, cameras, *images.shape[2:])
+        return HeadInputs(inverse_depth, encoded.features_cnn, units[0].context, units[2].features, encoded.neighbours)
+
+    def predict(self, images: Tensor, cameras: Cameras, inputs: HeadInputs) -> Predicted:
+        """Focused module, Gaussian head and adapter."""
+        features = self.pixel_features(normalise(images), inputs)
+        raw = self.head2(F.gelu(self.head1(features)))
+        if self.cross_view is not None:
+            raw = raw + self.cross_view(images, cameras, inputs)
+        depth = 1 / inputs.inverse_depth[:, 0]
+        return Predicted(depth, self.adapter(raw, depth, images, cameras), features, raw)
+
+    def fused_inverse_depth(
+        self, units: tuple[Boosted, Boosted, Boosted], cameras: Cameras, height: int, width: int
+    ) -> Tensor:
+        """The shares of the units and of the residual head, within the cameras' range: [views, 1, height, width]."""
+        last = units[2]
+        known = torch.cat([last.features, last.probability, last.inverse_depth], dim=1)
+        probability = self.residual(known, last.features.shape[0])
+        residual = (probability * last.candidates).sum(1, keepdim=True)
+        maps = [*(unit.inverse_depth for unit in units), residual]
+        fused = torch.zeros_like(maps[0][:, :, :1, :1])
+        for share, x in zip(DEPTH_SHARES, maps, strict=True):
+            fused = fused + share * resize(x, height, width)
+        farthest, nearest = cameras.inverse_range()
+        return torch.minimum(torch.maximum(fused, farthest), nearest)
+
+    def pixel_features(self, images: Tensor, inputs: HeadInputs) -> Tensor:
+        """The focused features of each pixel, [views, feature channels, H, W]; images are normalised."""
+        size, full_size = inputs.features_cnn.shape[2:], images.shape[2:]
+        parts = [
+            resize(F.pixel_unshuffle(self.conv_image(images), SHUFFLE), *size),
+            inputs.features_cnn,
+            inputs.context,
+            F.pixel_unshuffle(inputs.features_last, SHUFFLE),
+            resize(F.pixel_unshuffle(inputs.inverse_depth, SHUFFLE), *size),
+        ]
+        focused = self.focus(self.fuse(torch.cat(parts, dim=1)))
+        return resize(F.pixel_shuffle(self.expand(focused), SHUFFLE), *full_size)

@@ -1,0 +1,1 @@
+"""One module a camera format."""

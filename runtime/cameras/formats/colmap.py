@@ -1,0 +1,214 @@
+"""COLMAP's sparse models, binary and text, with rigs and frames or without, through pycolmap (extra `colmap`).
+
+COLMAP is as we are: OpenCV axes, pixels with the centre of the first at (.5, .5); its poses are world-to-camera.
+Images that were not registered are left out. The points that an image observes give its range of depth.
+
+A damaged binary model can make the library ask for all memory or never come back, so a process of its own reads it,
+within limits: this module run as a program prints what it found, as JSON.
+"""
+
+import importlib.util
+import json
+import math
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...errors import InputError, located
+from ...geometry.depth_bounds import range_of_depths
+from ...geometry.intrinsics import calibration
+from ...geometry.rigid import invert_rigid
+from ...system.files import check_regular, open_regular
+from ..camera import Camera
+from ..format_names import COLMAP_PARTS
+
+if TYPE_CHECKING:
+    import pycolmap
+
+PARTS = ("cameras", "images", "points3D")
+SUFFIXES = (".bin", ".txt")
+# Where COLMAP, nerfstudio and 3DGS put models, seen from the folder that holds everything.
+USUAL_PLACES = ("", "sparse", "colmap/sparse")
+
+# COLMAP's parameters in the order of its files.
+FOCAL, FOCALS = ("f", "cx", "cy"), ("fx", "fy", "cx", "cy")
+PERSPECTIVE = {
+    "SIMPLE_PINHOLE": FOCAL,
+    "PINHOLE": FOCALS,
+    "SIMPLE_RADIAL": (*FOCAL, "k1"),
+    "RADIAL": (*FOCAL, "k1", "k2"),
+    "OPENCV": (*FOCALS, "k1", "k2", "p1", "p2"),
+    "FULL_OPENCV": (*FOCALS, "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+}
+FISHEYE = {
+    "SIMPLE_RADIAL_FISHEYE": (*FOCAL, "k1"),
+    "RADIAL_FISHEYE": (*FOCAL, "k1", "k2"),
+    "OPENCV_FISHEYE": (*FOCALS, "k1", "k2", "k3", "k4"),
+}
+
+DEPTHS_USED = 500  # of one image, at least
+COUNT_BYTES, SMALLEST_RECORD = 8, 8
+# Of processor time, which other processes do not lengthen; a wall clock ends only what waits for ever.
+SECONDS, SECONDS_PER_MB = 20, 2
+WALL_FACTOR = 20
+OUT_OF_TIME = -getattr(signal, "SIGXCPU", 24)  # exit status of a process that the system ended for it
+MEMORY, MEMORY_PER_BYTE = 4 << 30, 40
+UNFINISHED = "COLMAP's library did not finish reading this model; is it damaged?"
+INSTALL = 'pip install "idesplat[colmap]"'
+
+
+def read(path: Path, pictures: Sequence[Path] = ()) -> list[Camera]:
+    """Read the model in a folder, in its usual place below, or beside one of its files; `pictures` are not needed.
+
+    Raises InputError, also where pycolmap is not installed.
+    """
+    models = models_in(path if path.is_dir() else path.parent)
+    if not models:
+        raise InputError(f"holds no COLMAP model, expected the files {', '.join(PARTS)} (.bin or .txt)")
+    if len(models) > 1:
+        raise InputError(f"holds {len(models)} COLMAP models; give one of them, such as {models[0]}")
+    cameras = []
+    for image in _read_apart(models[0]):
+        with located(image["name"]):
+            cameras.append(to_camera(image))
+    return cameras
+
+
+def models_in(folder: Path) -> list[Path]:
+    """The folder if it holds a model, or the models in their usual places below it."""
+    for place in USUAL_PLACES:
+        parent = folder / place
+        numbered = sorted(parent.glob("[0-9]*")) if parent.is_dir() else []
+        found = [candidate for candidate in (parent, *numbered) if _is_model(candidate)]
+        if found:
+            return found[:1] if found[0] == parent else found
+    return []
+
+
+def _is_model(folder: Path) -> bool:
+    return any(all((folder / (part + suffix)).is_file() for part in PARTS) for suffix in SUFFIXES)
+
+
+def _read_apart(model: Path) -> list[dict[str, Any]]:
+    """What `describe` finds, through a process that may fail in any way."""
+    if importlib.util.find_spec("pycolmap") is None:
+        raise InputError(f"is a COLMAP model, for which pycolmap is needed; {INSTALL}")
+    files = [file for file in model.iterdir() if file.suffix in SUFFIXES]
+    for file in files:
+        check_regular(file)
+    _check_counts(files)
+    size = sum(file.stat().st_size for file in files)
+    # -P: or else Python would look for modules in the current folder first
+    seconds = math.ceil(SECONDS + SECONDS_PER_MB * size / 1e6)
+    limits = str(MEMORY + MEMORY_PER_BYTE * size), str(seconds)
+    command = [sys.executable, "-P", "-m", __name__, str(model.absolute()), *limits]
+    try:
+        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=WALL_FACTOR * seconds)
+    except subprocess.TimeoutExpired:
+        raise InputError(UNFINISHED) from None
+    if done.returncode == OUT_OF_TIME:
+        raise InputError(UNFINISHED)
+    if done.returncode != 0:
+        reason = done.stderr.decode(errors="replace").strip().splitlines()[-1:] or [f"exit status {done.returncode}"]
+        raise InputError(f"COLMAP's library cannot read this model ({reason[0]}); is it damaged?")
+    images: list[dict[str, Any]] = json.loads(done.stdout)
+    if not images:
+        raise InputError("holds no registered image, expected a model with poses; is the reconstruction complete?")
+    return images
+
+
+def _check_counts(files: Sequence[Path]) -> None:
+    """Refuse a binary file whose first number, the count of its records, promises more than the file can hold."""
+    for file in files:
+        if file.suffix == ".bin" and file.stem in COLMAP_PARTS:
+            with open_regular(file) as opened:
+                count = int.from_bytes(opened.read(COUNT_BYTES), "little")
+            if count * SMALLEST_RECORD > file.stat().st_size:
+                raise InputError(
+                    f"{file.name} has room for fewer than the {count} records that it promises: cut off or damaged"
+                )
+
+
+def to_camera(image: dict[str, Any]) -> Camera:
+    """The camera of an image as `describe` gives it; raises InputError for a lens that is not ours."""
+    model = image["model"]
+    fields = PERSPECTIVE.get(model) or FISHEYE.get(model)
+    if fields is None:
+        known = ", ".join([*PERSPECTIVE, *FISHEYE])
+        raise InputError(f"camera model {model}, expected one of {known}; run COLMAP's image_undistorter first")
+    values = dict(zip(fields, image["parameters"], strict=True))
+    focal = values.get("f", 0.0)
+    K = calibration(values.get("fx", focal), values.get("fy", focal), values["cx"], values["cy"])
+    extrinsics = invert_rigid(np.array([*image["cam_from_world"], [0, 0, 0, 1]]))
+    fisheye = model in FISHEYE
+    order = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    count = 8 if "k3" in values and not fisheye else 4
+    distortion = tuple(values.get(field, 0.0) for field in order[:count])
+    return Camera(
+        image["name"],
+        image["width"],
+        image["height"],
+        K,
+        extrinsics,
+        distortion if fisheye or any(distortion) else None,
+        fisheye,
+        tuple(image["depth_range"]) if image["depth_range"] else None,
+    )
+
+
+# ---- what the library holds; from a file, in a process of its own
+
+
+def describe(reconstruction: "pycolmap.Reconstruction") -> list[dict[str, Any]]:
+    """The registered images of a model, in plain values as `to_camera` takes them, by name."""
+    images = [image for image in reconstruction.images.values() if image.has_pose]
+    found = []
+    for image in sorted(images, key=lambda image: image.name):
+        camera = image.camera
+        found.append(
+            {
+                "name": image.name,
+                "model": camera.model_name,
+                "width": camera.width,
+                "height": camera.height,
+                "parameters": camera.params.tolist(),
+                "cam_from_world": image.cam_from_world().matrix().tolist(),  # [3, 4]
+                "depth_range": range_of_depths(observed_depths(reconstruction, image)),
+            }
+        )
+    return found
+
+
+def observed_depths(reconstruction: "pycolmap.Reconstruction", image: "pycolmap.Image") -> np.ndarray:
+    """Depths of the points that an image observes, or of some of them, [points]."""
+    observed = image.get_observation_point2D_idxs()
+    observed = observed[:: max(1, len(observed) // DEPTHS_USED)]
+    points = np.array([reconstruction.point3D(image.point2D(index).point3D_id).xyz for index in observed]).reshape(
+        -1, 3
+    )
+    matrix = image.cam_from_world().matrix()  # [3, 4]
+    return points @ matrix[2, :3] + matrix[2, 3]
+
+
+def _limit_resources(memory: int, seconds: int) -> None:
+    try:
+        import resource
+    except ImportError:  # Windows has no such limit
+        return
+    resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
+    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
+
+
+if __name__ == "__main__":
+    _limit_resources(int(sys.argv[2]), int(sys.argv[3]))
+    try:
+        import pycolmap
+
+        print(json.dumps(describe(pycolmap.Reconstruction(sys.argv[1]))))
+    except Exception as error:  # whatever the library raises is a damaged model
+        sys.exit(" ".join(str(error).split()))

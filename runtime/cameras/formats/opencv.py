@@ -1,0 +1,138 @@
+"""OpenCV's stereo calibration, YAML or XML of cv2.FileStorage: two cameras, K and distortion of each, R and T.
+
+A point x of the first camera is R x + T in the second; the first camera is the world. OpenCV's pixel centres are whole
+numbers, so half a pixel is added to its principal points. Where a calibration is in two files, intrinsics.yml and
+extrinsics.yml, as OpenCV's sample writes it, either leads to the other. The file names no pictures: it takes two, the
+left (first) one before the right one, and their size where the file lacks it.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import InputError, located
+from ...geometry.rigid import invert_rigid
+from ...system.files import read_bytes
+from ..camera import Camera
+from ..parsing import EXPECTED, LARGEST
+
+# What the fields are called, in OpenCV's documentation, samples and forums.
+MATRIX = ("M{}", "K{}", "cameraMatrix{}", "camera_matrix_{}", "camera_matrix{}", "CM{}")
+DISTORTION = ("D{}", "distCoeffs{}", "dist_coeffs_{}", "dist_coeffs{}", "distortion_coefficients_{}")
+ROTATION = ("R", "rotation", "Rotation", "rotation_matrix")
+TRANSLATION = ("T", "translation", "Translation", "translation_vector")
+SIZE = ("imageSize", "image_size", "img_size", "size")
+WIDTH, HEIGHT = ("image_width", "imageWidth", "width"), ("image_height", "imageHeight", "height")
+OTHER_HALF = {"intrinsics": "extrinsics", "extrinsics": "intrinsics"}
+NAMES = ("left", "right")
+HALF_PIXEL = 0.5
+
+
+def read(path: Path, pictures: Sequence[Path] = ()) -> list[Camera]:
+    """Read the file; `pictures` are the left and the right one, in this order. Raises InputError."""
+    if pictures and len(pictures) != len(NAMES):
+        raise InputError(
+            f"calibrates two cameras, and {len(pictures)} images were given; give the left and the right one"
+        )
+    fields = _fields(path)
+    other = path.with_stem(OTHER_HALF.get(path.stem, path.stem))
+    if other != path and other.is_file():
+        with located(other.name):
+            fields = {**_fields(other), **fields}
+    pose = np.eye(4)
+    pose[:3, :3] = _rotation(_matrix(fields, ROTATION))
+    pose[:3, 3] = _matrix(fields, TRANSLATION, (3,))
+    cameras = []
+    for index, extrinsics in enumerate((np.eye(4), invert_rigid(pose))):
+        name = pictures[index].name if pictures else NAMES[index]
+        with located(f"camera {index + 1}"):
+            size = _size(fields, pictures[index : index + 1])
+            cameras.append(_camera(fields, index + 1, name, size, extrinsics))
+    return cameras
+
+
+def _camera(fields: dict[str, Any], number: int, name: str, size: tuple[int, int], extrinsics: np.ndarray) -> Camera:
+    K = _matrix(fields, [form.format(number) for form in MATRIX], (3, 3))
+    K = K + HALF_PIXEL * np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]])
+    forms = [form.format(number) for form in DISTORTION]
+    values = _matrix(fields, forms).ravel().tolist() if any(form in fields for form in forms) else []
+    return Camera(name, *size, K, extrinsics, tuple(values) if any(values) else None)
+
+
+def _fields(path: Path) -> dict[str, Any]:
+    """The fields of the file's top level: numbers, text and matrices (float64)."""
+    import cv2
+
+    text = read_bytes(path, EXPECTED, LARGEST).decode("utf-8", errors="replace")
+    try:
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        root = storage.root()
+        return {name: _value(root.getNode(name)) for name in list(root.keys())}
+    except (cv2.error, SystemError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"OpenCV cannot read this calibration ({reason}); is it damaged?") from None
+
+
+def _value(node: Any) -> Any:
+    """A node of cv2.FileStorage as number, text, matrix or list of numbers; None if it is anything else."""
+    if node.isReal() or node.isInt():
+        return node.real()
+    if node.isString():
+        return node.string()
+    if node.isMap():
+        matrix = node.mat()
+        return None if matrix is None else np.asarray(matrix, np.float64)
+    if node.isSeq():
+        items = [node.at(index) for index in range(node.size())]
+        return (
+            np.array([item.real() for item in items]) if all(item.isReal() or item.isInt() for item in items) else None
+        )
+    return None
+
+
+def _matrix(fields: dict[str, Any], names: Sequence[str], shape: tuple[int, ...] | None = None) -> np.ndarray:
+    """The first of these fields that is there, of this many numbers; raises InputError."""
+    name = next((name for name in names if name in fields), None)
+    if name is None:
+        raise InputError(
+            f"{names[0]} is missing (or {', '.join(names[1:])}); give the file that holds it, or both in one"
+        )
+    value = fields[name]
+    if not isinstance(value, np.ndarray) or (shape and value.size != np.prod(shape)):
+        expected = " x ".join(map(str, shape or ("numbers",)))
+        found = f"of shape {value.shape}" if isinstance(value, np.ndarray) else repr(value)
+        raise InputError(f"{name} is {found}, expected a matrix of {expected}")
+    if not np.isfinite(value).all():
+        raise InputError(f"{name} holds NaN or infinity, expected finite numbers")
+    return value.reshape(shape) if shape else value
+
+
+def _rotation(value: np.ndarray) -> np.ndarray:
+    """A rotation [3, 3], also where the file holds its axis times its angle."""
+    import cv2
+
+    if value.size == 3:
+        return cv2.Rodrigues(value.ravel())[0]
+    if value.shape != (3, 3):
+        raise InputError(f"R has shape {value.shape}, expected 3 x 3")
+    return value
+
+
+def _size(fields: dict[str, Any], pictures: Sequence[Path]) -> tuple[int, int]:
+    """Width and height, from the file or else from the picture."""
+    size = next((fields[name] for name in SIZE if name in fields), None)
+    if isinstance(size, np.ndarray) and size.size == 2:
+        width, height = size.ravel().tolist()
+    else:
+        width, height = (next((fields[name] for name in names if name in fields), None) for names in (WIDTH, HEIGHT))
+    if isinstance(width, float) and isinstance(height, float):
+        if not (width.is_integer() and height.is_integer()):
+            raise InputError(f"the image's size is {width:g} x {height:g}, expected whole pixels")
+        return int(width), int(height)
+    from ..image_files import GIVE_PICTURES, size_of
+
+    if not pictures:
+        raise InputError(f"gives no {SIZE[0]}, and there is no picture to take it from; {GIVE_PICTURES}")
+    return size_of(pictures[0])

@@ -1,0 +1,108 @@
+"""Fields of camera files, checked as they are read: numbers, names and poses in JSON objects and in lines of text."""
+
+import json
+import math
+import reprlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError, located
+from ..geometry.rigid import rigid
+from ..system.files import read_bytes
+
+EXPECTED = "a file of cameras"
+LARGEST = 512 * 2**20  # bytes
+
+
+def read_text(path: Path) -> str:
+    """The whole file as text; raises InputError."""
+    try:
+        return read_bytes(path, EXPECTED, LARGEST).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise InputError(f"is not text, expected {EXPECTED}") from None
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The JSON object in a file; raises InputError."""
+    content = read_bytes(path, EXPECTED, LARGEST)
+    try:
+        document = json.loads(content)
+    except RecursionError:
+        raise InputError("is not a file of cameras: JSON nested too deeply") from None
+    except ValueError as error:  # not JSON, not UTF-8, or a number with thousands of digits
+        raise InputError(f"is not valid JSON ({error}); expected {EXPECTED}") from None
+    if not isinstance(document, dict):
+        raise InputError(f"holds {shown(document)}, expected a JSON object with cameras")
+    return document
+
+
+def entries(document: Mapping[str, Any], field: str) -> list[dict[str, Any]]:
+    """The objects in a list, at least one."""
+    found = document.get(field)
+    if not isinstance(found, list) or not found or not all(isinstance(entry, dict) for entry in found):
+        raise InputError(f"{field} is {shown(found)}, expected a list of objects, at least one")
+    return found
+
+
+def image_name(entry: Mapping[str, Any], field: str) -> str:
+    """The path of an image."""
+    value = entry.get(field)
+    if not isinstance(value, str) or not PurePosixPath(value).name:
+        raise InputError(f"{field} is {shown(value)}, expected the path of an image")
+    return value
+
+
+def number(entry: Mapping[str, Any], field: str) -> float:
+    """A finite number."""
+    if field not in entry:
+        raise InputError(f"{field} is missing, expected a number")
+    return finite(entry[field], field)
+
+
+def finite(value: object, field: str) -> float:
+    """The value, once it is a finite number."""
+    try:
+        if isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value):
+            return float(value)
+    except OverflowError:  # an integer beyond float64
+        pass
+    raise InputError(f"{field} is {shown(value)}, expected a finite number")
+
+
+def pixels(entry: Mapping[str, Any], field: str) -> int:
+    """A side of an image."""
+    value = number(entry, field)
+    if value <= 0 or value != int(value):
+        raise InputError(f"{field} is {value:g}, expected a positive whole number of pixels")
+    return int(value)
+
+
+def pose(entry: Mapping[str, Any], field: str) -> np.ndarray:
+    """A rigid transform, [4, 4]."""
+    rows = entry.get(field)
+    if not (isinstance(rows, list) and len(rows) == 4 and all(isinstance(row, list) and len(row) == 4 for row in rows)):
+        raise InputError(f"{field} is {shown(rows)}, expected the camera's pose as 4 rows of 4 numbers")
+    with located(field):
+        return rigid(np.array([[finite(value, f"row {i}") for value in row] for i, row in enumerate(rows)]))
+
+
+def numbers(words: Sequence[str]) -> list[float]:
+    """Words as finite numbers."""
+    values = []
+    for word in words:
+        try:
+            value = float(word)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise InputError(f"holds {shown(word)}, expected a finite number")
+        values.append(value)
+    return values
+
+
+def shown(value: object) -> str:
+    """A value for a message, shortened."""
+    return "missing" if value is None else reprlib.repr(value)

@@ -1,0 +1,46 @@
+"""The command idesplat-convert: one splat file to another."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..errors import InputError, exit_on_input_error
+from .outputs import Overwrite, guards_outputs, outputs
+from .terminal import run, say
+
+
+@exit_on_input_error
+@guards_outputs("idesplat-convert")
+def convert(
+    scene: Annotated[Path, typer.Argument(help="Splat file to read.", show_default=False)],
+    out: Annotated[Path, typer.Argument(help="File to write.", show_default=False)],
+    min_opacity: Annotated[float, typer.Option(help="Leave out fainter Gaussians, 0 to 1.")] = 0,
+    overwrite: Overwrite = False,
+) -> None:
+    """Write a splat file in another format, which follows from the file's name.
+
+    .ply, .compressed.ply, .splat, .spz, .sog and .glb are read and written; .points.ply, .points.glb, .obj and .xyz are
+    written as points. What a format cannot hold is named.
+    """
+    from ..splats.io import read_offset, read_scene, scene_suffix, write_scene
+
+    scene_suffix(out)
+    outputs().reads("the scene", [scene])
+    outputs().writes("", [out])
+    if not 0 <= min_opacity <= 1:
+        raise InputError(f"--min-opacity {min_opacity:g}: expected a number from 0 to 1")
+    gaussians = read_scene(scene)
+    if min_opacity:
+        whole, gaussians = len(gaussians), gaussians.taken(gaussians.opacities >= min_opacity)
+        if not len(gaussians):
+            raise InputError(f"--min-opacity {min_opacity:g}: no Gaussian is left of {whole}; use a smaller one")
+        say(f"cleaned: {whole - len(gaussians):,} too faint; {len(gaussians):,} Gaussians left")
+    for note in write_scene(out, gaussians, read_offset(scene)):
+        say(f"note: {note}")
+    say(f"wrote {out}: {len(gaussians):,} Gaussians, {out.stat().st_size / 1e6:.1f} MB")
+
+
+def main() -> None:
+    """Entry point of idesplat-convert."""
+    run(convert)

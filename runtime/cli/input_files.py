@@ -1,0 +1,102 @@
+"""Which files stand behind what a command is given, so that `outputs` can protect them all."""
+
+import glob
+import os
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ..cameras.camera import Camera
+
+# Where else datasets keep photographs, which no command of ours reads there unasked.
+UNDISTORTED_FROM = "input"
+
+
+def model_files(model: Path) -> list[Path]:
+    """A model with the files of its weights, or all files of a staged folder; none where there is none."""
+    if os.path.isdir(model):
+        return [path for path in _children(model) if os.path.isfile(path)]
+    return [model, *(Path(name) for name in glob.glob(f"{glob.escape(str(model))}*data"))]
+
+
+def camera_files(cameras: Path) -> list[Path]:
+    """The files that are read where this file or folder is given as cameras."""
+    from ..cameras.format_names import COLMAP_PARTS
+    from ..cameras.formats import colmap as cameras_colmap
+    from ..cameras.formats import dtu as cameras_dtu
+    from ..cameras.formats import llff as cameras_llff
+    from ..cameras.formats import opencv as cameras_opencv
+    from ..cameras.formats import transforms as cameras_transforms
+
+    if not os.path.isdir(cameras):
+        found = [cameras]
+        if cameras.stem in cameras_opencv.OTHER_HALF:
+            found.append(cameras.with_stem(cameras_opencv.OTHER_HALF[cameras.stem]))
+        folder = cameras.parent if cameras.stem in COLMAP_PARTS else None
+    else:
+        found = [cameras / cameras_transforms.FILE_NAME, cameras / cameras_llff.FILE_NAME]
+        found += cameras_dtu.files_in(cameras)
+        folder = cameras
+    if folder is not None:
+        found += [path for model in cameras_colmap.models_in(folder) for path in _children(model)]
+    return [path for path in found if os.path.isfile(path)]
+
+
+def given_images(given: Sequence[str | Path]) -> list[Path]:
+    """The images, or videos, that folders, globs and files stand for; nothing is said of what there is not."""
+    from ..images.io import SUFFIXES
+
+    found: list[Path] = []
+    for item in given:
+        path = Path(item)
+        if os.path.isdir(path):
+            found += [child for child in _children(path) if child.suffix.lower() in SUFFIXES]
+        elif os.path.exists(path):
+            found.append(path)
+        else:
+            found += [Path(name) for name in glob.glob(str(item), recursive=True)]
+    return found
+
+
+def named_images(path: Path, cameras: Iterable["Camera"]) -> list[Path]:
+    """The images that cameras name, as paths beside their file; they need not exist.
+
+    path: the file or folder that the cameras were read from.
+    """
+    folder = path if os.path.isdir(path) else path.parent
+    return [folder / _posix(camera.name) for camera in cameras]
+
+
+def nearby_images(path: Path, cameras: Iterable["Camera"]) -> list[Path]:
+    """The files that are most likely the images of the cameras: of their names, where datasets keep images.
+
+    path: the file or folder that the cameras were read from, such as `sparse/0` beside a folder `images`.
+    """
+    from ..cameras.image_files import IMAGE_FOLDERS, image_roots
+    from ..images.io import SUFFIXES, stem
+
+    stems_in = defaultdict(set)  # folder of a name -> its stems
+    for camera in cameras:
+        name = _posix(camera.name)
+        stems_in[name.parent].add(stem(name))
+    roots, names = image_roots(path), ("", *IMAGE_FOLDERS, UNDISTORTED_FROM)
+    found = []
+    for below, stems in stems_in.items():
+        for place in dict.fromkeys(root / name / below for root in roots for name in names):
+            children = (child for child in _children(place) if child.suffix.lower() in SUFFIXES)
+            found += [child for child in children if stem(child) in stems]
+    return found
+
+
+def _children(folder: Path) -> list[Path]:
+    """What a folder holds; nothing where it cannot be read, or is none."""
+    try:
+        return list(folder.iterdir())
+    except (OSError, ValueError):
+        return []
+
+
+def _posix(name: str) -> PurePosixPath:
+    return PurePosixPath(name.replace("\\", "/"))  # files written on Windows

@@ -1,0 +1,261 @@
+"""The command idesplat-render: a splat file to pictures or a video."""
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from ..cameras.camera import Camera, relative_cameras
+from ..cameras.io import CameraFormat, read_cameras
+from ..errors import InputError, exit_on_input_error
+from ..images.sizes import parse_size
+from ..images.video_writer import check_video_support, open_video
+from ..images.writing import depth_colours, depth_ends, save_png
+from ..rendering.cameras import (
+    FULL_TURN,
+    MOST_FRAMES,
+    STILL,
+    SWING,
+    along_path,
+    around,
+    check_shots,
+    fitted,
+    frame_names,
+    overview,
+)
+from ..rendering.render_view import draw_view
+from ..rendering.types import Rendering
+from ..splats.gaussians import Gaussians
+from ..splats.io import read_offset, read_scene
+from ..system.files import replacing
+from ..system.progress import progress
+from .input_files import camera_files, named_images, nearby_images
+from .outputs import Overwrite, guards_outputs, name_files, outputs
+from .terminal import run, say
+
+COMMAND = "idesplat-render"
+VIDEO, PICTURE = ".mp4", ".png"
+COLOUR, DEPTH, ALPHA = "", "-depth", "-alpha"  # what a picture shows, as its name ends
+SOLID = 0.5  # alpha from which on a pixel has a depth
+SIZE = "360x640"  # where neither cameras nor --size say so
+MOST_LISTED = 12  # files that are named one by one
+
+
+@exit_on_input_error
+@guards_outputs(COMMAND)
+def render(
+    scene: Annotated[Path, typer.Argument(help="Splat file of any format.", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Folder for pictures, one .png, or one .mp4.", show_default=False)],
+    cameras: Annotated[Path | None, typer.Option(help="Cameras, such as a transforms.json.")] = None,
+    camera_format: Annotated[
+        CameraFormat | None, typer.Option(help="What --cameras is, where that is not recognised.")
+    ] = None,
+    orbit: Annotated[bool, typer.Option("--orbit", help="Go around the scene.")] = False,
+    path: Annotated[bool, typer.Option("--path", help="Go smoothly through the cameras.")] = False,
+    degrees: Annotated[
+        float | None, typer.Option(help="Of the orbit: 360 by default, with cameras a swing of 30.", show_default=False)
+    ] = None,
+    frames: Annotated[int, typer.Option(help=f"How many pictures --orbit and --path make, 1 to {MOST_FRAMES}.")] = 90,
+    fps: Annotated[float, typer.Option(help="Frames a second of an .mp4.")] = 30,
+    size: Annotated[
+        str | None, typer.Option(help=f"HEIGHTxWIDTH: the cameras' by default, or {SIZE}.", show_default=False)
+    ] = None,
+    depth: Annotated[bool, typer.Option("--depth", help="Draw depth, too (colours, and metric .npz).")] = False,
+    alpha: Annotated[bool, typer.Option("--alpha", help="Draw opacity, too.")] = False,
+    background: Annotated[
+        str, typer.Option(help="Red, green and blue behind the scene, 0 to 1, such as 1,1,1.", metavar="R,G,B")
+    ] = "0,0,0",
+    overwrite: Overwrite = False,
+) -> None:
+    """Draw a splat file as the cameras see it, on a path through them, in an orbit, or from where all of it is seen.
+
+    Pictures are named after the cameras' images and have the cameras' own size. They show the ideal pinhole view: where
+    a camera has lens distortion, compare with the undistorted photograph.
+    """
+    colour = _parse_background(background)
+    if not 0 < fps <= 1000:
+        raise InputError(f"--fps {fps:g}: expected frames a second, 1 to 1000")
+    if not 1 <= frames <= MOST_FRAMES:
+        raise InputError(f"--frames {frames}: expected 1 to {MOST_FRAMES} pictures")
+    _check_out(out)
+    if path and orbit:
+        raise InputError("--path and --orbit: expected one of them")
+    views = read_cameras(cameras, form=camera_format) if cameras else []
+    if path and not views:
+        raise InputError("--path: needs the cameras that it leads through; give --cameras, or use --orbit")
+    kinds = [COLOUR, *[DEPTH] * depth, *[ALPHA] * alpha]
+    names = frame_names(frames) if path or orbit else [view.name for view in views] or [STILL]
+    stems = _stems(names, out, kinds)
+    _announce(scene, cameras, views, stems, out, kinds)
+    gaussians = read_scene(scene)
+    views = relative_cameras(views, read_offset(scene))
+    shots = _shots(gaussians, views, orbit, path, degrees, frames, size)
+    check_shots(shots)
+    draw = _drawer(gaussians, colour)
+    if out.suffix.lower() == VIDEO:
+        written = _film(draw, shots, out, fps, kinds)
+    else:
+        written = _pictures(draw, shots, stems, kinds)
+    for file in written if len(written) <= MOST_LISTED else [f"{len(written)} files in {out}"]:
+        say(f"wrote {file}")
+    pictures = "1 picture" if len(shots) == 1 else f"{len(shots)} pictures"
+    say(f"{len(gaussians):,} Gaussians drawn in {pictures}; open {out} in any {_viewer(out)}")
+
+
+def main() -> None:
+    """Run the command."""
+    run(render)
+
+
+def _check_out(out: Path) -> None:
+    """Refuse what is not made: a kind of picture or video by its name, or any video where its library is missing."""
+    from ..images.io import SUFFIXES as PICTURES
+    from ..images.video import SUFFIXES as VIDEOS
+
+    if out.suffix.lower() in {*PICTURES, *VIDEOS, ".gif"} - {PICTURE, VIDEO} and not out.is_dir():
+        raise InputError(f"--out {out}: expected a folder, or a file that ends in {PICTURE} or {VIDEO}")
+    if out.suffix.lower() == VIDEO:
+        check_video_support()
+
+
+def _parse_background(text: str) -> tuple[float, float, float]:
+    """The option --background, `R,G,B` with numbers from 0 to 1; raises InputError."""
+    try:
+        red, green, blue = (float(part) for part in text.split(","))
+    except ValueError:
+        red = green = blue = float("nan")
+    if not all(0 <= value <= 1 for value in (red, green, blue)):
+        raise InputError(f"--background {text}: expected red, green and blue from 0 to 1, such as 1,1,1")
+    return red, green, blue
+
+
+def _announce(
+    scene: Path, cameras: Path | None, views: Sequence[Camera], stems: Sequence[Path], out: Path, kinds: Sequence[str]
+) -> None:
+    """Say what is read and what will be written, so that nothing is replaced that must not be; raises InputError.
+
+    The photographs are not read, but nothing may be drawn over them. What this command has drawn is none of them.
+    """
+    run = outputs()
+    run.reads("the scene", [scene])
+    if cameras is not None:
+        run.reads("the cameras", camera_files(cameras))
+        run.reads("a photograph", named_images(cameras, views))
+        nearby = nearby_images(cameras, views)
+        run.reads("a photograph", [image for image in nearby if run.writer_of(image) != COMMAND])
+    if out.suffix.lower() == VIDEO:
+        run.writes("--out", [_film_path(out, kind) for kind in kinds])
+        return
+    run.writes("--out", [_picture_path(stem, kind) for stem in stems for kind in kinds])
+    if DEPTH in kinds:
+        run.writes("--out", [_metric_path(stem) for stem in stems])
+
+
+def _film_path(out: Path, kind: str) -> Path:
+    return out.with_stem(out.stem + kind)
+
+
+def _picture_path(stem: Path, kind: str) -> Path:
+    return stem.with_name(stem.name + kind + PICTURE)
+
+
+def _metric_path(stem: Path) -> Path:
+    """Of the depth in world units."""
+    return stem.with_name(stem.name + DEPTH + ".npz")
+
+
+def _shots(
+    gaussians: Gaussians,
+    views: Sequence[Camera],
+    orbit: bool,
+    path: bool,
+    degrees: float | None,
+    frames: int,
+    size: str | None,
+) -> list[Camera]:
+    """Where to draw the scene from."""
+    if views and size:
+        views = [fitted(view, *parse_size(size)) for view in views]
+    if path:
+        return along_path(views, frames)
+    if orbit:
+        centre = list(views) or [overview(gaussians, *parse_size(size or SIZE))]
+        return around(gaussians, centre, degrees or (SWING if views else FULL_TURN), frames)
+    return list(views) or [overview(gaussians, *parse_size(size or SIZE))]
+
+
+def _drawer(gaussians: Gaussians, background: tuple[float, float, float]) -> Callable[[Camera], Rendering]:
+    def draw(shot: Camera) -> Rendering:
+        return draw_view(gaussians, shot.extrinsics, shot.K, shot.width, shot.height, background)
+
+    return draw
+
+
+def _film(
+    draw: Callable[[Camera], Rendering], shots: Sequence[Camera], out: Path, fps: float, kinds: Sequence[str]
+) -> list[Path]:
+    """A video of each kind; the paths written."""
+    width, height = shots[0].width, shots[0].height
+    for shot in shots:
+        if (shot.width, shot.height) != (width, height):
+            raise InputError(
+                f"--out {out}: {shot.name} has {shot.width}x{shot.height} pixels, {shots[0].name} {width}x{height}, "
+                "and a video has one size; add --size"
+            )
+    ends: tuple[float, float] | None = None  # the first frame's, so that colours mean the same in all
+    with ExitStack() as stack:
+        films = {kind: _film_path(out, kind) for kind in kinds}
+        add = {kind: stack.enter_context(open_video(film, width, height, fps)) for kind, film in films.items()}
+        for shot in progress(shots, "drawing"):
+            drawn = draw(shot)
+            ends = ends or depth_ends(_depth(drawn))
+            for kind in kinds:
+                add[kind](_picture(drawn, kind, ends))
+    return list(films.values())
+
+
+def _pictures(
+    draw: Callable[[Camera], Rendering], shots: Sequence[Camera], stems: Sequence[Path], kinds: Sequence[str]
+) -> list[Path]:
+    """A picture of each kind for each shot, and metric depth; the paths written."""
+    written = []
+    for shot, stem in progress(list(zip(shots, stems, strict=True)), "drawing"):
+        drawn = draw(shot)
+        for kind in kinds:
+            target = _picture_path(stem, kind)
+            save_png(target, _picture(drawn, kind))
+            written.append(target)
+        if DEPTH in kinds:
+            metric = _metric_path(stem)
+            with replacing(metric) as temporary:
+                np.savez_compressed(temporary, depth=_depth(drawn))
+            written.append(metric)
+    return written
+
+
+def _depth(drawn: Rendering) -> np.ndarray:
+    """The mean depth of what stops the light, in world units, 0 where most of it passes."""
+    return np.where(drawn.alpha >= SOLID, drawn.depth / np.maximum(drawn.alpha, SOLID), 0).astype(np.float32)
+
+
+def _picture(drawn: Rendering, kind: str, ends: tuple[float, float] | None = None) -> np.ndarray:
+    """One kind of picture of a rendering, RGB in [0, 1], [height, width, 3]."""
+    if kind == DEPTH:
+        return depth_colours(_depth(drawn), ends)
+    return np.repeat(drawn.alpha[..., None], 3, axis=2) if kind == ALPHA else drawn.rgb
+
+
+def _stems(names: Sequence[str], out: Path, kinds: Sequence[str]) -> list[Path]:
+    """The pictures' paths without kind and suffix; raises InputError if several are to go into one file."""
+    if out.suffix.lower() != PICTURE:
+        return [out / name for name in name_files(names, kinds)]
+    if len(names) > 1:
+        raise InputError(f"--out {out}: {len(names)} pictures do not fit one file; give a folder or an .mp4")
+    return [out.with_suffix("")]
+
+
+def _viewer(out: Path) -> str:
+    return "browser or video player" if out.suffix.lower() == VIDEO else "image viewer"

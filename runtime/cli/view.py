@@ -1,0 +1,159 @@
+"""The command idesplat-view: a splat file in a browser, served on this machine or as one file to send."""
+
+import contextlib
+import webbrowser
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ..cameras.io import CameraFormat
+from ..errors import InputError, Terminated, exit_on_input_error
+from .outputs import Overwrite, guards_outputs, outputs
+from .terminal import run, say
+
+if TYPE_CHECKING:
+    from ..cameras.camera import Camera
+    from ..viewer.viser_scene import Viewpoint
+
+LOOPBACK = "127.0.0.1"
+PORT = 8080
+
+
+@exit_on_input_error
+@guards_outputs("idesplat-view")
+def view(
+    scene: Annotated[Path, typer.Argument(help="Splat file of any format.", show_default=False)],
+    cameras: Annotated[Path | None, typer.Option(help="Cameras to draw, such as a transforms.json.")] = None,
+    camera_format: Annotated[
+        CameraFormat | None, typer.Option(help="What --cameras is, where that is not recognised.")
+    ] = None,
+    images: Annotated[
+        list[Path] | None,
+        typer.Option(help="Folder, glob or files of the cameras' photographs, or their video.", show_default=False),
+    ] = None,
+    more_images: Annotated[list[Path] | None, typer.Argument(hidden=True)] = None,
+    html: Annotated[
+        Path | None, typer.Option(help="Write one .html that opens anywhere, without network, instead of serving.")
+    ] = None,
+    host: Annotated[str, typer.Option(help="Address to serve at; other machines do not see the default.")] = LOOPBACK,
+    port: Annotated[int, typer.Option(help="Port to serve at, 0 for any.", min=0, max=65535)] = PORT,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
+    overwrite: Overwrite = False,
+) -> None:
+    """Look at a splat file in the browser, from the first camera, with the cameras and their photographs around it.
+
+    With --images only the cameras of these photographs are drawn. A click at a camera leads there (not in an .html).
+    Nothing is fetched from the network.
+    """
+    from ..splats.io import read_scene
+
+    if images and cameras is None:
+        raise InputError("--images: needs the cameras that took them; give --cameras")
+    if html is not None:
+        _check_page(html, scene, cameras, [*(images or []), *(more_images or [])])
+    gaussians = read_scene(scene)
+    viewpoints = read_viewpoints(cameras, camera_format, [*(images or []), *(more_images or [])])
+    viewpoints = _relative(viewpoints, scene)
+    if html is None:
+        from ..viewer.server import address
+        from ..viewer.viser_scene import serving
+
+        with serving(gaussians, viewpoints, host, port) as server, _until_interrupted():
+            page = address(host, server.get_port())
+            click = "a click at a camera leads there, " if viewpoints else ""
+            say(f"{len(gaussians):,} Gaussians to look at: {page} ({click}stop with Ctrl-C)")
+            if browser:
+                webbrowser.open(page)
+            server.sleep_forever()
+        return
+    from ..system.files import replacing
+    from ..system.progress import working
+    from ..viewer.viser_scene import standalone_page
+
+    with working("making the page"):
+        page = standalone_page(gaussians, viewpoints)
+    with replacing(html) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+    say(f"wrote {html}: {len(gaussians):,} Gaussians, {html.stat().st_size / 1e6:.1f} MB; open it in any browser")
+
+
+def main() -> None:
+    """Entry point of idesplat-view."""
+    run(view)
+
+
+@contextlib.contextmanager
+def _until_interrupted() -> Iterator[None]:
+    """Take Ctrl-C, by which a user ends this command, for its success; another signal is none."""
+    try:
+        yield
+    except Terminated:
+        raise
+    except KeyboardInterrupt:
+        return
+
+
+def _check_page(html: Path, scene: Path, cameras: Path | None, images: list[Path]) -> None:
+    """Find out before the work whether the page can be written, and is none of the files to read."""
+    from .input_files import camera_files, given_images
+
+    if html.suffix.lower() not in (".html", ".htm") or html.is_dir():
+        raise InputError(f"--html {html}: expected a file to write, whose name ends in .html")
+    run = outputs()
+    run.reads("the scene", [scene])
+    run.reads("the cameras", camera_files(cameras) if cameras else [])
+    run.reads("a photograph", given_images(images))
+    run.writes("--html", [html])
+
+
+def _relative(viewpoints: "list[Viewpoint]", scene: Path) -> "list[Viewpoint]":
+    """The viewpoints in the world of a scene that was written relative to an offset."""
+    from ..cameras.camera import relative_cameras
+    from ..splats.io import read_offset
+
+    cameras = relative_cameras([viewpoint.camera for viewpoint in viewpoints], read_offset(scene))
+    return [viewpoint._replace(camera=camera) for viewpoint, camera in zip(viewpoints, cameras, strict=True)]
+
+
+def read_viewpoints(cameras: Path | None, form: CameraFormat | None, images: list[Path]) -> "list[Viewpoint]":
+    """The cameras of the photographs, with these, without distortion; all cameras where there are no photographs.
+
+    Raises InputError for what cannot be read, or does not belong together.
+    """
+    from dataclasses import replace
+
+    from ..cameras.io import read_cameras
+    from ..system.files import scratch_folder
+    from ..system.progress import progress
+    from ..viewer.viser_scene import Viewpoint
+    from ..views.batch import match
+    from ..views.sources import find_photographs
+
+    if cameras is None:
+        return []
+    if not images:
+        return [
+            Viewpoint(replace(camera, distortion=None, fisheye=False), None)
+            for camera in read_cameras(cameras, form=form)
+        ]
+    with scratch_folder() as folder:
+        files = find_photographs(images, cameras, form, folder)
+        pairs = match(files, read_cameras(cameras, files, form))
+        return [_viewpoint(file, camera) for file, camera in progress(pairs, "reading photographs")]
+
+
+def _viewpoint(file: Path, camera: "Camera") -> "Viewpoint":
+    """A camera with its photograph, without distortion."""
+    from ..cameras.camera import resized
+    from ..cameras.undistortion import undistort
+    from ..errors import located
+    from ..images.io import load_image
+    from ..viewer.viser_scene import Viewpoint
+
+    photograph = load_image(file)
+    with located(str(file)):
+        camera = resized(camera, photograph.shape[1], photograph.shape[0])
+    photograph, camera = undistort(photograph, camera)
+    return Viewpoint(camera, photograph)

@@ -1,0 +1,1 @@
+"""Rotations, trajectories, and depth maps as geometry."""

@@ -1,0 +1,25 @@
+"""Images that come as arrays: what their numbers mean is told by their type, or not at all."""
+
+import numpy as np
+
+from ..errors import InputError
+
+EXPECTED = "expected RGB [height, width, 3], as uint8 in 0 to 255 or as floating point in [0, 1]"
+
+
+def eight_bit_image(image: np.ndarray, name: str) -> np.ndarray:
+    """RGB [height, width, 3], as uint8 or as floating point in [0, 1], as uint8.
+
+    Raises InputError, naming the image, for other shapes, types and ranges: 12 bits in uint16, 0 to 255 in float32 or
+    [-1, 1] cannot be told apart from what they are not.
+    """
+    if image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
+        raise InputError(f"{name}: an image of shape {image.shape}; {EXPECTED}")
+    if image.dtype == np.uint8:
+        return np.ascontiguousarray(image)
+    if not np.issubdtype(image.dtype, np.floating):
+        raise InputError(f"{name}: an image of type {image.dtype}; {EXPECTED}")
+    low, high = float(image.min()), float(image.max())
+    if not (low >= 0 and high <= 1):  # also NaN
+        raise InputError(f"{name}: an image of {image.dtype} with values from {low:g} to {high:g}; {EXPECTED}")
+    return np.rint(image * 255).astype(np.uint8)

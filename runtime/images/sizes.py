@@ -1,0 +1,36 @@
+"""Image sizes as commands are given them and as networks take them."""
+
+from ..errors import InputError
+from ..system.limits import SIDE_PIXELS, whole_number
+
+SHOWN = 40  # characters of an option that a message repeats
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """The option --size, `HEIGHTxWIDTH`, as two numbers; raises InputError."""
+    sides = [whole_number(part) for part in text.lower().split("x")]
+    if len(sides) != 2 or not all(sides):
+        raise InputError(f"--size {text[:SHOWN]}: expected HEIGHTxWIDTH, such as 256x256")
+    height, width = (side or 0 for side in sides)
+    if max(height, width) > SIDE_PIXELS.value:
+        raise InputError(
+            f"--size {text}: expected sides of {SIDE_PIXELS.value} pixels at most; choose a smaller one, or "
+            f"{SIDE_PIXELS.remedy}"
+        )
+    return height, width
+
+
+def size_fits(height: int, width: int, multiple: int) -> bool:
+    """Whether a network whose sizes go in steps of `multiple` takes this one."""
+    return height % multiple == width % multiple == 0 and min(height, width) >= 2 * multiple
+
+
+def nearest_size(aspect: float, area: float, multiple: int) -> tuple[int, int]:
+    """Height and width in steps of `multiple`, with a quotient near `aspect` and a product near `area` in pixels."""
+    height, width = (multiple * max(2, round((area * side) ** 0.5 / multiple)) for side in (aspect, 1 / aspect))
+    return height, width
+
+
+def size_rule(multiple: int) -> str:
+    """What `size_fits` asks, in words."""
+    return f"height and width must be multiples of {multiple} from {2 * multiple}"

@@ -1,0 +1,1 @@
+"""ONNX models: metadata, sessions, and the predictor."""

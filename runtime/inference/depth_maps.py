@@ -1,0 +1,63 @@
+"""Depth maps as files that lead back to points: beside the depth, everything that it takes to do so.
+
+For each view a .png to look at, and a .npz with
+
+    depth       z-depth in world units, float32 [height, width]
+    K           pixels of the depth map, pixel centres at .5, no distortion, float64 [3, 3]
+    extrinsics  camera-to-world, OpenCV axes (x right, y down, z forward), float64 [4, 4]
+    near, far   between which the depth was looked for, world units
+    image       the name of the photograph
+    image_size  width and height of the photograph, pixels
+    crop        from pixels (x, y, 1) of the undistorted photograph to those of the depth map, float64 [3, 3]
+    offset      what was subtracted from the user's world coordinates (--offset), float64 [3]
+
+so that the pixel in column x and row y lies at `extrinsics[:3, :3] @ (depth[y, x] * inv(K) @ (x + .5, y + .5, 1)) +
+extrinsics[:3, 3]`.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..images.resizing import cover
+from ..images.writing import save_depth_png
+from ..system.files import replacing
+from ..views.batch import Views
+from .predictor import Prediction
+
+ENDINGS = (".png", ".npz")
+
+
+def depth_map_files(folder: Path, stems: Sequence[str]) -> list[Path]:
+    """The files that `write_depth_maps` writes."""
+    return [folder / (stem + ending) for stem in stems for ending in ENDINGS]
+
+
+def write_depth_maps(folder: Path, stems: Sequence[str], prediction: Prediction, views: Views) -> list[Path]:
+    """Write a picture and an archive of each view's depth into an existing folder; the paths written.
+
+    stems: the files' names without suffix, all different, [views]. views: what was predicted from.
+    Raises InputError if a file cannot be written.
+    """
+    written = []
+    parts = zip(stems, prediction.depth, prediction.cameras, views.cameras, strict=True)
+    for stem, depth, camera, original in parts:
+        picture, archive = depth_map_files(folder, [stem])
+        save_depth_png(picture, depth)
+        near, far = camera.depth_range or (np.nan, np.nan)
+        with replacing(archive) as temporary:
+            np.savez_compressed(
+                temporary,
+                depth=depth,
+                K=camera.K,
+                extrinsics=camera.extrinsics,
+                near=near,
+                far=far,
+                image=original.name,
+                image_size=(original.width, original.height),
+                crop=cover(original.width, original.height, camera.width, camera.height).matrix,
+                offset=views.offset,
+            )
+        written += [picture, archive]
+    return written

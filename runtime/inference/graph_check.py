@@ -1,0 +1,199 @@
+"""Whether a graph is what its metadata and manifest say: before it runs by its signature, afterwards by its results."""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from mmap import ACCESS_READ, mmap
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from ..errors import InputError
+from ..system.files import open_regular
+from .metadata import INPUTS, OUTPUTS, Description
+from .metadata_fields import shown
+
+FLOAT = "tensor(float)"
+# A tensor in ONNX's format whose values lie in another file says so by the property "location" and the file's name.
+LOCATION = re.compile(rb"\n\x08location\x12([\x01-\x7f])", re.DOTALL)
+# The same with a name of 128 bytes and more, whose length takes two bytes.
+LONG_LOCATION = re.compile(rb"\n\x08location\x12[\x80-\xff][\x01-\x7f]", re.DOTALL)
+# Protobuf reads no message of 2 GiB or more.
+LARGEST_FILE = (1 << 31) - 1
+
+
+class Value(Protocol):
+    """An input or output as ONNX Runtime describes it; names and None stand for dimensions that are open."""
+
+    name: str
+    type: str
+    shape: Sequence[int | str | None]
+
+
+class Graph(Protocol):
+    """The part of an ONNX Runtime session that is looked at."""
+
+    def get_inputs(self) -> Sequence[Value]:
+        """What it reads."""
+
+    def get_outputs(self) -> Sequence[Value]:
+        """What it yields."""
+
+
+def check_file(path: Path) -> None:
+    """Raise InputError for a graph that no ONNX file can be, or whose weights lie outside its folder or are not there.
+
+    ONNX Runtime refuses most of this, too, but not in every version, and waits for ever for a named pipe.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: is no regular file, expected a .onnx file made by idesplat-export")
+    size = path.stat().st_size
+    if size > LARGEST_FILE:
+        raise InputError(f"{path}: has {size >> 30} GiB, expected a graph of less than 2 GiB; is it an .onnx file?")
+    if size:
+        for location in _external_files(path):
+            _check_location(path, location)
+
+
+def _external_files(path: Path) -> Iterator[str]:
+    """The names of the files that hold some of a graph's weights."""
+    with open_regular(path) as file, mmap(file.fileno(), 0, access=ACCESS_READ) as content:
+        if LONG_LOCATION.search(content):
+            raise InputError(f"{path}: keeps weights in a file whose name has more than 127 bytes; export it again")
+        for found in {content[at.end() : at.end() + at.group(1)[0]] for at in LOCATION.finditer(content)}:
+            yield found.decode(errors="replace")
+
+
+def _check_location(path: Path, location: str) -> None:
+    folder = path.parent.resolve()
+    try:
+        beside = (folder / location).resolve()
+        inside = not Path(location).is_absolute() and beside.is_relative_to(folder)
+        there = beside.is_file()
+    except ValueError:  # a name that no file can have
+        inside = there = False
+    if not inside:
+        raise InputError(f"{path}: keeps weights in {shown(location)}, outside its folder; expected a file beside it")
+    if not there:
+        raise InputError(f"{path}: keeps weights in {shown(location)}, which is no file; move it along with the graph")
+
+
+def check_fused(path: Path, graph: Graph, own: Description) -> None:
+    """Raise InputError unless the one graph takes the network's inputs and yields what the description promises."""
+    inputs, outputs = ({value.name: value for value in part} for part in (graph.get_inputs(), graph.get_outputs()))
+    unknown = [name for name in inputs if name not in INPUTS]
+    if unknown:
+        raise _mismatch(path, f"it reads {shown(unknown[0])}, expected {', '.join(INPUTS)}")
+    missing = [name for name in promised(own) if name not in outputs]
+    if missing:
+        raise _mismatch(path, f"it does not yield {missing[0]}")
+    _check_values(path, inputs, outputs, own)
+
+
+def check_stage(
+    path: Path, graph: Graph, reads: Sequence[str], yields: Sequence[str], own: Description, known: dict[str, str]
+) -> None:
+    """Raise InputError unless a staged folder's graph reads and yields what the manifest says.
+
+    known: the types of all that earlier stages yield, by name; those of this stage are added.
+    """
+    inputs, outputs = ({value.name: value for value in part} for part in (graph.get_inputs(), graph.get_outputs()))
+    for found, expected, does in ((inputs, reads, "reads"), (outputs, yields, "yields")):
+        for name in sorted(set(found) ^ set(expected)):
+            who, other = ("graph", "manifest") if name in found else ("manifest", "graph")
+            raise _mismatch(path, f"by the {who} it {does} {shown(name)}, by the {other} it does not")
+    for name, value in inputs.items():
+        if known.get(name, value.type) != value.type:
+            raise _mismatch(path, f"{shown(name)} is a {value.type}, an earlier stage yields a {known[name]}")
+    known |= {name: value.type for name, value in outputs.items()}
+    _check_values(path, inputs, outputs, own)
+
+
+def promised(own: Description) -> Sequence[str]:
+    """What a model yields in the end."""
+    return OUTPUTS if own.gaussians else OUTPUTS[:1]
+
+
+def check_results(values: Mapping[str, object], views: int, height: int, width: int, own: Description) -> None:
+    """Raise InputError unless the results have the shapes and ranges that `Prediction` promises."""
+    count, coefficients = views * height * width, (own.sh_degree + 1) ** 2
+    shapes: dict[str, tuple[int, ...]] = {
+        "depth": (views, height, width),
+        "means": (count, 3),
+        "scales": (count, 3),
+        "quats": (count, 4),
+        "opacities": (count,),
+        "sh": (count, coefficients, 3),
+    }
+    for name in promised(own):
+        value = values[name]
+        if not isinstance(value, np.ndarray) or value.dtype != np.float32 or value.shape != shapes[name]:
+            found = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
+            raise InputError(f"the graph yields {name} as {found}, expected float32 {shapes[name]}; export it again")
+        finite = np.isfinite(value)
+        if not finite.all():
+            share = 100 * (1 - finite.mean())
+            raise InputError(
+                f"the graph yields NaN or infinity in {share:.3g} % of {name}: its weights are damaged, or its "
+                f"precision ({shown(own.precision)}) does not hold its numbers; export it again, in float32"
+            )
+    _check_signs(values, own)
+
+
+def _check_signs(values: Mapping[str, object], own: Description) -> None:
+    """Depth is positive, and so are scales; opacities are shares."""
+    ranges = {"depth": (np.nextafter(np.float32(0), 1), np.inf), "scales": (0, np.inf), "opacities": (0, 1)}
+    for name, (low, high) in ranges.items():
+        value = values[name] if name in promised(own) else None
+        if isinstance(value, np.ndarray) and not (value.min() >= low and value.max() <= high):
+            raise InputError(
+                f"the graph yields {name} from {value.min():g} to {value.max():g}, expected "
+                f"{'0 to 1' if high == 1 else 'positive numbers'}; export it again"
+            )
+
+
+def _check_values(path: Path, inputs: Mapping[str, Value], outputs: Mapping[str, Value], own: Description) -> None:
+    """Types and shapes of the network's own inputs and outputs; those between stages may be of any kind."""
+    views = own.fixed_views or None
+    height, width = (own.height, own.width) if own.fixed_size else (None, None)
+    count = views * height * width if views and height and width else None
+    shapes: dict[str, tuple[int | None, ...]] = {
+        "images": (views, 3, height, width),
+        "extrinsics": (views, 4, 4),
+        "intrinsics": (views, 3, 3),
+        "near": (views,),
+        "far": (views,),
+        "depth": (views, height, width),
+        "means": (count, 3),
+        "scales": (count, 3),
+        "quats": (count, 4),
+        "opacities": (count,),
+        "sh": (count, (own.sh_degree + 1) ** 2, 3),
+    }
+    for values, reads in ((inputs, True), (outputs, False)):
+        for name, value in values.items():
+            if name in shapes and value.type != FLOAT:
+                raise _mismatch(path, f"{name} is a {value.type}, expected {FLOAT}")
+            if name in shapes and not _fits(value.shape, shapes[name], exactly=reads):
+                raise _mismatch(path, f"{name} has the shape {_words(value.shape)}, expected {_words(shapes[name])}")
+
+
+def _fits(found: Sequence[int | str | None], expected: Sequence[int | None], exactly: bool) -> bool:
+    """Whether a declared shape allows what is expected.
+
+    exactly: a dimension that is open must be so in the graph, too; of results, the optimiser may find out more.
+    """
+    if not found and not exactly:  # ONNX Runtime's word for a shape that is not known
+        return True
+    sizes = [size if isinstance(size, int) else None for size in found]
+    if exactly:
+        return sizes == list(expected)
+    return len(sizes) == len(expected) and all(None in (a, b) or a == b for a, b in zip(sizes, expected, strict=True))
+
+
+def _words(shape: Sequence[int | str | None]) -> str:
+    return "[" + ", ".join("any" if size is None else str(size)[:40] for size in shape) + "]"
+
+
+def _mismatch(path: Path, what: str) -> InputError:
+    return InputError(f"{path}: the graph is not what its metadata says: {what}; export it again")

@@ -1,0 +1,274 @@
+"""The pipeline as a library: a model file or staged folder, arrays in, depth and Gaussians out."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..cameras.camera import Camera
+from ..errors import InputError, located
+from ..images.arrays import eight_bit_image
+from ..images.sizes import size_fits, size_rule
+from ..splats.gaussians import Gaussians
+from ..views.batch import Views, check_views, prepare
+from ..views.depth_range import DepthRange, find_depth_range
+from .graph_check import check_file, check_fused, check_results, check_stage, promised
+from .metadata import INPUTS, Description, StageFile, read_description, read_manifest
+from .normalization import SceneFrame
+from .session import CPU, USUAL, Tuning, open_session, provider_name, run_limit_s, run_session
+
+FUSED = "model"
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """depth: metric z-depth in scene units, float32 [views, height, width].
+
+    gaussians: ordered by view, row, column; None from a depth-only model (`Runner.description.gaussians` is false).
+    cameras: the views' cameras at the size of the depth maps, [views]: K in pixels of these, pixel centres at .5, poses
+    camera-to-world with OpenCV axes, no distortion, `depth_range` near and far. With them, depth leads back to points.
+    """
+
+    depth: np.ndarray
+    gaussians: Gaussians | None
+    # Seconds by stage; a fused file is one stage called "model".
+    seconds: dict[str, float] = field(default_factory=dict)
+    cameras: list[Camera] = field(default_factory=list)
+
+    def need_gaussians(self) -> Gaussians:
+        """The Gaussians, for what cannot do without them; raises InputError if there are none."""
+        if self.gaussians is None:
+            raise InputError("this model predicts depth alone; give one that predicts Gaussians, too")
+        return self.gaussians
+
+
+class Runner:
+    """An exported model, ready to run.
+
+    model: a `.onnx` of this project, or a folder that `idesplat-export --staged` wrote.
+    provider: an ONNX Runtime execution provider, such as CPU or CUDA.
+    tuning: threads and profiling, for those who measure.
+    Raises InputError if the model is not ours or damaged, or the provider is not there.
+    """
+
+    def __init__(self, model: Path | str, provider: str = CPU, tuning: Tuning = USUAL) -> None:
+        self.path = Path(model)
+        if not self.path.exists():
+            raise InputError(f"{self.path}: no such model; give a .onnx file or staged folder made by idesplat-export")
+        provider = provider_name(provider)
+        stages = read_manifest(self.path) if self.path.is_dir() else [StageFile(FUSED, self.path.name, [], [])]
+        folder = self.path if self.path.is_dir() else self.path.parent
+        for stage in stages:
+            check_file(folder / stage.file)
+        started = time.perf_counter()
+        self._stages = [
+            (stage, open_session(folder / stage.file, provider, _profiled(tuning, stage))) for stage in stages
+        ]
+        self.load_seconds = time.perf_counter() - started
+        try:
+            properties = self._stages[0][1].get_modelmeta().custom_metadata_map
+            self.description: Description = read_description(properties, self.path)
+            self._check_graphs(folder)
+        except UnicodeDecodeError:
+            raise InputError(f"{self.path}: damaged: its metadata or names are not UTF-8; export it again") from None
+        self._keep = _last_uses([stage for stage, _ in self._stages])
+
+    def predict(
+        self,
+        images: Sequence[Path | np.ndarray],
+        cameras: Sequence[Camera],
+        near: float | None = None,
+        far: float | None = None,
+        size: tuple[int, int] | None = None,
+    ) -> Prediction:
+        """Predict depth and Gaussians from photographs of any size.
+
+        images: files, or RGB [h, w, 3], as uint8 in 0 to 255 or as floating point in [0, 1], which is rounded to 8 bits
+        as files have them. cameras: one for each image, as `read_cameras` gives them.
+        near, far: scene units; as `depth_range` finds them where not given. size: height and width to work at.
+        Raises InputError for anything that cannot be used.
+        """
+        if len(images) != len(cameras):
+            raise InputError(f"{len(images)} images and {len(cameras)} cameras, expected one camera for each image")
+        height, width = size or self.size_for(cameras)
+        self.check_size(len(images), height, width)
+        given = [
+            (eight_bit_image(image, camera.name) if isinstance(image, np.ndarray) else image, camera)
+            for image, camera in zip(images, cameras, strict=True)
+        ]
+        return self.predict_views(prepare(given, None, height, width), near, far)
+
+    def predict_views(self, views: Views, near: float | None = None, far: float | None = None) -> Prediction:
+        """Predict depth and Gaussians from views as `prepare` makes them.
+
+        near, far: scene units; as `depth_range` finds them where not given.
+        Raises InputError for anything the model cannot take.
+        """
+        span = self.depth_range(views, near, far)
+        return self._predict(views.images, views.extrinsics, views.intrinsics, span.near, span.far, views.names)
+
+    def depth_range(self, views: Views, near: float | None = None, far: float | None = None) -> DepthRange:
+        """Near and far for these views, and where they come from; what is given stays.
+
+        Raises InputError if near is not before far.
+        """
+        trained = self.description.near, self.description.far
+        return find_depth_range(
+            views.images, views.extrinsics, views.intrinsics, views.cameras, trained, near, far, views.samples
+        )
+
+    def predict_arrays(
+        self,
+        images: np.ndarray,  # [views, 3, height, width]
+        extrinsics: np.ndarray,  # [views, 4, 4]
+        intrinsics: np.ndarray,  # [views, 3, 3]
+        near: float | np.ndarray | None = None,
+        far: float | np.ndarray | None = None,
+    ) -> Prediction:
+        """Predict depth and Gaussians from arrays at a size that the model takes.
+
+        images: RGB in [0, 1], floating point. extrinsics: camera-to-world, OpenCV axes, in any unit.
+        intrinsics: row 0 divided by the width, row 1 by the height; pixel centres at .5.
+        near, far: in the unit of the poses, one number or one for each view. What is not given is found, from points
+        matched between the views or from their baseline, as `depth_range` does. It is never the range of the model's
+        training, which is of no meaning in another unit.
+        The network itself works in a frame and unit of its own (`SceneFrame`): a scene in any unit gives the same
+        result, in that unit.
+        Raises InputError for anything the model cannot take.
+        """
+        check_views(images, extrinsics, intrinsics, near, far)
+        self.check_size(len(images), *np.shape(images)[2:])
+        arrays = np.asarray(images), np.asarray(extrinsics), np.asarray(intrinsics)
+        if near is None or far is None:
+            trained = self.description.near, self.description.far
+            nearest = None if near is None else float(np.min(near))
+            farthest = None if far is None else float(np.max(far))
+            span = find_depth_range(*arrays, (), trained, near=nearest, far=farthest)
+            near, far = span.near if near is None else near, span.far if far is None else far
+        return self._predict(*arrays, near, far, [f"view {index}" for index in range(len(images))])
+
+    def _predict(
+        self,
+        images: np.ndarray,
+        extrinsics: np.ndarray,
+        intrinsics: np.ndarray,
+        near: float | np.ndarray,
+        far: float | np.ndarray,
+        names: Sequence[str],
+    ) -> Prediction:
+        """`predict_arrays`, with the names of the views."""
+        check_views(images, extrinsics, intrinsics, near, far)
+        views, _, height, width = images.shape
+        self.check_size(views, height, width)
+        nearest, farthest = (np.full(views, depth, np.float64) for depth in (near, far))
+        frame = SceneFrame.of(extrinsics, nearest, self.description.near)
+        values = {
+            "images": np.ascontiguousarray(images, np.float32),
+            "extrinsics": frame.enter(extrinsics),
+            "intrinsics": np.ascontiguousarray(intrinsics, np.float32),
+            "near": (nearest * frame.scale).astype(np.float32),
+            "far": (farthest * frame.scale).astype(np.float32),
+        }
+        Ks = np.array([[width], [height], [1]]) * intrinsics.astype(np.float64)  # [views, 3, 3]
+        ranges = zip(nearest.tolist(), farthest.tolist(), strict=True)
+        cameras = [
+            Camera(name, width, height, K, pose, depth_range=span)
+            for name, K, pose, span in zip(names, Ks, extrinsics, ranges, strict=True)
+        ]
+        return replace(self._run(values, frame), cameras=cameras)
+
+    def _check_graphs(self, folder: Path) -> None:
+        """Raise InputError unless the graphs are what metadata and manifest say of them."""
+        if not self.path.is_dir():
+            (stage, session), outputs = self._stages[0], list(promised(self.description))
+            check_fused(self.path, session, self.description)
+            self._stages = [(replace(stage, inputs=list(INPUTS), outputs=outputs), session)]
+            return
+        types: dict[str, str] = {}
+        for stage, session in self._stages:
+            check_stage(folder / stage.file, session, stage.inputs, stage.outputs, self.description, types)
+        missing = [name for name in promised(self.description) if name not in types]
+        if missing:
+            raise InputError(f"{self.path}: no stage yields {missing[0]}; export it again")
+
+    def end_profiling(self) -> list[Path]:
+        """Stop noting operators, where `tuning.profile` asked for it; the files of notes, one for each stage."""
+        return [Path(session.end_profiling()) for _, session in self._stages]
+
+    def size_for(self, cameras: Sequence[Camera]) -> tuple[int, int]:
+        """The trained height and width, turned upright where most pictures are and the model leaves the choice."""
+        own = self.description
+        upright = sum(camera.height > camera.width for camera in cameras) * 2 > len(cameras)
+        turn = upright and own.width > own.height and not own.fixed_size
+        return (own.width, own.height) if turn else (own.height, own.width)
+
+    def view_count(self, asked: int | None, named: int | None, default: int | None) -> int | None:
+        """How many views to use; None for all.
+
+        asked: by --views. named: how many images --frames names. default: where neither says so, and the model takes
+        any number.
+        Raises InputError where the model was exported for a number of views, and another is asked for.
+        """
+        fixed = self.description.fixed_views
+        if not fixed:
+            return asked or (None if named else default)
+        if asked is not None and asked != fixed:
+            raise InputError(f"--views {asked}: {self._fixed()}; use --views {fixed}, or export without --views")
+        if named is not None and (named < fixed or (named > fixed and asked is None)):
+            more = "" if named < fixed else f", or add --views {fixed} to have the best of them chosen"
+            raise InputError(f"--frames names {named} images: {self._fixed()}; name {fixed}{more}")
+        return fixed
+
+    def _fixed(self) -> str:
+        return f"{self.path} was exported for {self.description.fixed_views} views"
+
+    def check_size(self, views: int, height: int, width: int) -> None:
+        """Raise InputError unless the model takes this many views of this size."""
+        own = self.description
+        if own.fixed_views and views != own.fixed_views:
+            raise InputError(f"{self._fixed()} and got {views}; give {own.fixed_views}, or export without --views")
+        if own.fixed_size and (height, width) != (own.height, own.width):
+            raise InputError(
+                f"{self.path}: was exported for {own.height}x{own.width} and got {height}x{width}; "
+                f"use --size {own.height}x{own.width}, or export without --size"
+            )
+        if not size_fits(height, width, own.size_multiple):
+            rule = size_rule(own.size_multiple)
+            raise InputError(f"{self.path}: cannot take images of {height}x{width}; {rule}")
+
+    def _run(self, values: dict[str, np.ndarray], frame: SceneFrame) -> Prediction:
+        seconds = {}
+        views, _, height, width = values["images"].shape
+        limit_s = run_limit_s(views * height * width)
+        for (stage, session), keep in zip(self._stages, self._keep, strict=True):
+            started = time.perf_counter()
+            with located(str(self.path) if stage.name == FUSED else f"{self.path}: stage {stage.name}"):
+                values.update(run_session(session, values, stage.outputs, limit_s))
+            seconds[stage.name] = time.perf_counter() - started
+            values = {name: value for name, value in values.items() if name in keep}
+        with located(str(self.path)):
+            check_results(values, views, height, width, self.description)
+        gaussians = None
+        if self.description.gaussians:
+            parts = (values[name] for name in ("means", "scales", "quats", "opacities", "sh"))
+            gaussians = frame.leave(Gaussians(*parts))
+        return Prediction(frame.leave_depth(values["depth"]), gaussians, seconds)
+
+
+def _profiled(tuning: Tuning, stage: StageFile) -> Tuning:
+    """`tuning` with a file of notes of the stage's own."""
+    if tuning.profile is None:
+        return tuning
+    return replace(tuning, profile=tuning.profile.with_name(f"{tuning.profile.name}-{stage.name}"))
+
+
+def _last_uses(stages: list[StageFile]) -> list[set[str]]:
+    """For each stage, the tensors that are still needed after it: later stages' inputs, or the last one's outputs."""
+    needed = set(stages[-1].outputs)
+    keep = []
+    for stage in reversed(stages):
+        keep.append(set(needed))
+        needed |= set(stage.inputs)
+    return keep[::-1]

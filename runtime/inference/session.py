@@ -1,0 +1,236 @@
+"""ONNX Runtime sessions: providers checked, threads and memory set from measurement, runs with a time limit."""
+
+import os
+import re
+import threading
+import warnings
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+
+from ..errors import InputError
+from ..system.files import check_regular
+from . import openvino
+from .graph_cache import place_for
+
+CPU = "CPUExecutionProvider"
+# Errors reach the caller as exceptions; ONNX Runtime's own log would print them to the terminal a second time.
+FATAL_ONLY = 4
+AS_MANY_AS_CORES = 0  # threads
+SUFFIX = "ExecutionProvider"
+# The longest that a graph may run, so that one that never ends is ended: several times what the slowest of the networks
+# takes on one core of a slow machine.
+LONGEST_RUN_S = 900.0
+LONGEST_RUN_S_PER_PIXEL = 2e-3  # of all views together
+LIMIT_VARIABLE = "IDESPLAT_RUN_LIMIT"  # in the environment: seconds, instead of both
+LONGEST_REASON = 300  # characters of ONNX Runtime's messages that are quoted
+# What its messages begin with: a source file, a line and a function.
+SOURCE = re.compile(r"^\S+\.(?:cc|h):\d+ .*?\) ")
+OUT_OF_MEMORY = ("Failed to allocate memory", "bad_alloc", "bad allocation", "out of memory")
+
+onnxruntime.set_default_logger_severity(FATAL_ONLY)
+
+
+def provider_name(provider: str) -> str:
+    """`cuda`, `CUDA` or `CUDAExecutionProvider` -> the last; raises InputError naming what is installed."""
+    wanted = provider.removesuffix(SUFFIX).lower()
+    if wanted == openvino.PROVIDER.removesuffix(SUFFIX).lower():
+        if not openvino.installed():
+            raise InputError("execution provider OpenVINO is not installed; pip install 'idesplat[openvino]'")
+        return openvino.PROVIDER
+    available = onnxruntime.get_available_providers()
+    for name in available:
+        if name.removesuffix(SUFFIX).lower() == wanted:
+            return name
+    offered = ", ".join(name.removesuffix(SUFFIX) for name in available)
+    raise InputError(f"execution provider {provider} is not installed; this ONNX Runtime offers {offered}")
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """How sessions are opened, for those who measure; everyone else does best with the defaults."""
+
+    # None: as many as the process may use.
+    threads: int | None = None
+    # The beginning of the name of a file in which ONNX Runtime notes the time and the shapes of every operator.
+    profile: Path | None = None
+    # False runs the graph as it stands in the file.
+    optimise: bool = True
+
+
+USUAL = Tuning()
+
+
+def open_session(model: Path | bytes, provider: str = CPU, tuning: Tuning = USUAL) -> onnxruntime.InferenceSession:
+    """Load a graph on one execution provider, given by its full name, as `provider_name` gives it.
+
+    On the CPU a file's optimised graph is kept for the next time (see `graph_cache`).
+    Raises InputError if the file cannot be loaded, if ONNX Runtime silently fell back to another provider, or if
+    OpenVINO has no processor to run on.
+    """
+    if isinstance(model, Path):
+        with suppress(OSError):  # ONNX Runtime says that there is no such file
+            check_regular(model)
+    options = _options(tuning)
+    if provider == openvino.PROVIDER:
+        openvino.add_openvino(options)
+    if provider == CPU and isinstance(model, Path) and tuning.optimise:
+        cached = _open_cached(model, options)
+        if cached is not None:
+            return cached
+    try:
+        session = _create(model, options, provider)
+    except Exception as error:  # ONNX Runtime raises many kinds, all derived from Exception alone
+        where = "the model" if isinstance(model, bytes) else model
+        raise InputError(
+            f"{where}: ONNX Runtime cannot load it ({_reason(error)}); is it an .onnx file of this project?"
+        ) from None
+    if session.get_providers()[0] != provider:
+        raise InputError(
+            f"{provider} was asked for, but ONNX Runtime fell back to {session.get_providers()[0]}; "
+            "its libraries are missing or do not fit, or choose another --provider"
+        )
+    return session
+
+
+def usable_cores() -> int:
+    """How many processor cores this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _options(tuning: Tuning) -> onnxruntime.SessionOptions:
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = FATAL_ONLY
+    # Its planning is quadratic in the number of nodes: without it a session opens ten times faster, and a run takes
+    # neither longer nor more memory, because the arena reuses buffers all the same.
+    options.enable_mem_reuse = False
+    # From a first run it would learn one block for all of the next, and keep the first's memory besides: half as much
+    # again, for no time.
+    options.enable_mem_pattern = False
+    # Left alone, ONNX Runtime 1.31 pins a thread to every core, also to those that the process was told to keep off.
+    restricted = usable_cores() < (os.cpu_count() or 1)
+    options.intra_op_num_threads = tuning.threads or (usable_cores() if restricted else AS_MANY_AS_CORES)
+    if tuning.profile is not None:
+        options.enable_profiling, options.profile_file_prefix = True, str(tuning.profile)
+    if not tuning.optimise:
+        options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+        options.add_session_config_entry("session.disable_prepacking", "1")  # else a profile misses weights' shapes
+    return options
+
+
+def _create(
+    model: Path | bytes, options: onnxruntime.SessionOptions, provider: str = CPU
+) -> onnxruntime.InferenceSession:
+    source = model if isinstance(model, bytes) else str(model)
+    providers = None if provider == openvino.PROVIDER else [provider]  # a plug-in is named in the options
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of a provider that is not there, which `open_session` raises for
+        return onnxruntime.InferenceSession(source, options, providers=providers)
+
+
+def _open_cached(model: Path, options: onnxruntime.SessionOptions) -> onnxruntime.InferenceSession | None:
+    """A session of the optimised graph, which is kept if it was not yet; None where that does not work out."""
+    place = place_for(model)
+    if place is None:
+        return None
+
+    def optimise(kept: Path) -> onnxruntime.InferenceSession:
+        options.optimized_model_filepath = str(kept)
+        return _create(model, options)
+
+    found = place.find()
+    try:
+        if found is None:
+            return place.fill(optimise)
+        options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+        return _create(found, options)
+    except Exception:  # a damaged model, a full disk: opening the model itself says what is wrong, if anything is
+        if found is not None:
+            place.forget(found)
+        return None
+    finally:
+        options.optimized_model_filepath = ""
+        options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_ALL
+
+
+def run_session(
+    session: onnxruntime.InferenceSession,
+    feeds: dict[str, np.ndarray],
+    outputs: Sequence[str] | None = None,
+    limit_s: float | None = None,
+) -> dict[str, np.ndarray]:
+    """Run a graph on the feeds that it takes, and return its outputs, or those named, by name.
+
+    limit_s: seconds after which the run is ended; None for no limit. It is ended between two operators: one that never
+    ends by itself cannot be.
+    Raises InputError if an input is missing, the graph cannot run on these feeds, or it did not end in time.
+    """
+    missing = [entry.name for entry in session.get_inputs() if entry.name not in feeds]
+    if missing:
+        raise InputError(f"the graph needs the input {missing[0]}, which is not given; export the model again")
+    wanted = {entry.name: feeds[entry.name] for entry in session.get_inputs()}
+    names = [entry.name for entry in session.get_outputs()] if outputs is None else list(outputs)
+    options = onnxruntime.RunOptions()
+    options.log_severity_level = FATAL_ONLY
+    ended = threading.Event()
+    watchdog = _watchdog(options, ended, limit_s)
+    try:
+        found = session.run(names, wanted, options)
+    except Exception as error:  # of many kinds, as above; also where memory runs out
+        if ended.is_set():
+            late = f"the graph did not end within {limit_s:g} s and was stopped"
+            raise InputError(f"{late}; allow more by the environment variable {LIMIT_VARIABLE}=SECONDS") from None
+        raise InputError(f"ONNX Runtime cannot run the graph ({_reason(error)}){_remedy(error)}") from None
+    finally:
+        if watchdog is not None:
+            watchdog.cancel()
+    return dict(zip(names, found, strict=True))
+
+
+def run_limit_s(pixels: int) -> float:
+    """Seconds that a graph may run on views of so many pixels together; raises InputError for a limit that is none."""
+    given = os.environ.get(LIMIT_VARIABLE)
+    if given is None:
+        return LONGEST_RUN_S + LONGEST_RUN_S_PER_PIXEL * pixels
+    try:
+        limit = float(given)
+    except ValueError:
+        limit = 0.0
+    if not 0 < limit <= threading.TIMEOUT_MAX:
+        raise InputError(f"{LIMIT_VARIABLE} is {given}: expected the seconds that a model may run, such as 3600")
+    return limit
+
+
+def _watchdog(options: onnxruntime.RunOptions, ended: threading.Event, limit_s: float | None) -> threading.Timer | None:
+    """A thread that has the run with these options end once its time is over."""
+    if limit_s is None:
+        return None
+
+    def end() -> None:
+        ended.set()
+        options.terminate = True
+
+    timer = threading.Timer(limit_s, end)
+    timer.daemon = True  # a command that is interrupted does not wait for it
+    timer.start()
+    return timer
+
+
+def _reason(error: Exception) -> str:
+    """ONNX Runtime's message in one line, without status codes and places in its source code."""
+    text = " ".join(str(error).split())
+    _, found, message = text.partition("Status Message: ")
+    reason = SOURCE.sub("", message if found else text.split(" : ")[-1])
+    return reason if len(reason) <= LONGEST_REASON else reason[:LONGEST_REASON] + "..."
+
+
+def _remedy(error: Exception) -> str:
+    if isinstance(error, MemoryError) or any(sign in str(error) for sign in OUT_OF_MEMORY):
+        return ": there is not enough memory; use fewer views or a smaller size"
+    return "; is it damaged? export it again"

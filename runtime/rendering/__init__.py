@@ -1,0 +1,1 @@
+"""Rasterisation of Gaussians on the CPU."""

@@ -1,0 +1,209 @@
+"""The rasteriser's two heavy steps compiled by numba: the arithmetic of `rasterizer`, one splat after another.
+
+Importing this raises ImportError where numba (extra `fast`) is not installed, and RuntimeError where there is no folder
+to keep compiled code in: compiling anew in every process would take longer than drawing without.
+"""
+
+import functools
+from math import exp, log
+
+import numba
+import numpy as np
+
+from ..geometry.sh import SH_0, SH_1, SH_2, SH_3
+from .types import (
+    DILATION,
+    FIELD_OF_VIEW_MARGIN,
+    MAX_ALPHA,
+    MIN_ALPHA,
+    MIN_LOG_TRANSMITTANCE,
+    PROJECTED_AT_ONCE,
+    Scene,
+    Splats,
+    View,
+)
+
+# Fragments are float32, as there: at a limit both must decide alike.
+LOWEST_ALPHA, HIGHEST_ALPHA = np.float32(MIN_ALPHA), np.float32(MAX_ALPHA)
+LOG_MIN_ALPHA = log(MIN_ALPHA)
+MIN_TRANSMITTANCE = exp(MIN_LOG_TRANSMITTANCE)
+CLOSED = 0.0  # the transmittance of a pixel that takes no more
+
+_compiled = functools.partial(numba.njit, cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+
+
+def project(scene: Scene, start: int, view: View) -> Splats:
+    """Those Gaussians of the block from `start` on that touch the image, as ellipses, in the order given."""
+    block = Scene(*(field[start : start + PROJECTED_AT_ONCE] for field in scene))
+    count = len(block.means)
+    ellipses, spans = np.empty((6, count)), np.empty((3, count), np.int64)
+    paint = np.empty((count, 4), np.float32)
+    _project(*block, *view, ellipses, spans, paint)
+    splats = Splats._make([*ellipses, *spans, paint])
+    touching = (splats.rows > 0) & (splats.columns > 0)
+    return splats if touching.all() else splats.taken(np.flatnonzero(touching))
+
+
+def composite_band(splats: Splats, top: int, rows: int, width: int) -> np.ndarray:
+    """Sums [rows, width, 5] of red, green, blue, depth and alpha over the image rows from `top` on."""
+    sums = np.zeros((rows, width, 5), np.float32)
+    _draw_band(*splats, top, sums)
+    return sums
+
+
+@_compiled()
+def _project(
+    means: np.ndarray,
+    quats: np.ndarray,
+    scales: np.ndarray,
+    opacities: np.ndarray,
+    sh: np.ndarray,
+    viewmat: np.ndarray,
+    K: np.ndarray,
+    width: int,
+    height: int,
+    near: float,
+    ellipses: np.ndarray,  # [6, gaussians]
+    spans: np.ndarray,  # [3, gaussians]
+    paint: np.ndarray,  # [gaussians, 4]
+) -> None:
+    """Fill the fields of `Splats`; a Gaussian that is not seen gets no rows."""
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    margin_x, margin_y = FIELD_OF_VIEW_MARGIN * 0.5 * width / fx, FIELD_OF_VIEW_MARGIN * 0.5 * height / fy
+    position = np.empty(3)
+    for axis in range(3):
+        position[axis] = -np.sum(viewmat[:3, axis] * viewmat[:3, 3])
+    point, rotation = np.empty(3), np.empty((3, 3))
+    basis = np.empty(sh.shape[1], np.float32)
+    for index in range(len(means)):
+        for axis in range(3):
+            point[axis] = viewmat[axis, 3]
+            for other in range(3):
+                point[axis] += viewmat[axis, other] * means[index, other]
+        z = point[2]
+        if not (z > near and opacities[index] >= LOWEST_ALPHA):
+            spans[1, index] = 0
+            continue
+        across, down = point[0] / z, point[1] / z
+        x, y = fx * across + cx, fy * down + cy
+        across = min(max(across, -cx / fx - margin_x), (width - cx) / fx + margin_x)
+        down = min(max(down, -cy / fy - margin_y), (height - cy) / fy + margin_y)
+        _rotation(quats[index], rotation)
+        xx, xy, yy = 0.0, 0.0, 0.0
+        for column in range(3):
+            half_x, half_y = 0.0, 0.0
+            for row in range(3):
+                along = rotation[row, column] * scales[index, column]
+                half_x += fx / z * (viewmat[0, row] - across * viewmat[2, row]) * along
+                half_y += fy / z * (viewmat[1, row] - down * viewmat[2, row]) * along
+            xx += half_x * half_x
+            xy += half_x * half_y
+            yy += half_y * half_y
+        x_variance, y_variance = xx + DILATION, yy + DILATION
+        shear = xy / y_variance
+        reach = np.log(np.float64(opacities[index] / LOWEST_ALPHA))
+        ellipses[0, index], ellipses[1, index], ellipses[2, index] = x, y, shear
+        ellipses[3, index] = max(x_variance - shear * shear * y_variance, DILATION)
+        ellipses[4, index], ellipses[5, index] = y_variance, reach
+        spans[0, index], spans[1, index] = _span(y, np.sqrt(2 * reach * y_variance), height)
+        _, spans[2, index] = _span(x, np.sqrt(2 * reach * x_variance), width)
+        _fill_basis(means[index], position, basis)
+        for channel in range(3):
+            colour = np.float32(0.5)
+            for coefficient in range(len(basis)):
+                colour += basis[coefficient] * sh[index, coefficient, channel]
+            paint[index, channel] = max(colour, np.float32(0))
+        paint[index, 3] = z
+
+
+@_compiled()
+def _rotation(quat: np.ndarray, rotation: np.ndarray) -> None:
+    """Fill the rotation matrix [3, 3] of a wxyz quaternion, which is normalised first; zero means no rotation."""
+    w, x, y, z = np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
+    norm = max(np.sqrt(w * w + x * x + y * y + z * z), 1e-12)
+    w, x, y, z = w / norm, x / norm, y / norm, z / norm
+    rotation[0, 0], rotation[0, 1], rotation[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    rotation[1, 0], rotation[1, 1], rotation[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    rotation[2, 0], rotation[2, 1], rotation[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+
+
+@_compiled()
+def _span(centre: float, half: float, size: int) -> tuple[int, int]:
+    """First pixel whose centre lies within centre +- half, and how many do, of an image `size` pixels long."""
+    first = min(max(np.ceil(centre - half - 0.5), 0.0), float(size))
+    last = min(max(np.floor(centre + half - 0.5), -1.0), size - 1.0)
+    return int(first), max(int(last - first + 1), 0)
+
+
+@_compiled()
+def _fill_basis(mean: np.ndarray, position: np.ndarray, basis: np.ndarray) -> None:
+    """Fill the spherical harmonics of 3DGS, [coefficients], in the direction from `position` to `mean`."""
+    basis[0] = SH_0
+    if len(basis) == 1:
+        return
+    x, y, z = mean[0] - position[0], mean[1] - position[1], mean[2] - position[2]
+    norm = max(np.sqrt(x * x + y * y + z * z), 1e-12)
+    x, y, z = x / norm, y / norm, z / norm
+    basis[1], basis[2], basis[3] = -SH_1 * y, SH_1 * z, -SH_1 * x
+    if len(basis) == 4:
+        return
+    xx, yy, zz = x * x, y * y, z * z
+    basis[4], basis[5] = SH_2[0] * x * y, -SH_2[0] * y * z
+    basis[6] = SH_2[1] * (2 * zz - xx - yy)
+    basis[7], basis[8] = -SH_2[0] * x * z, SH_2[2] * (xx - yy)
+    if len(basis) == 9:
+        return
+    basis[9], basis[10] = -SH_3[0] * y * (3 * xx - yy), SH_3[1] * x * y * z
+    basis[11] = -SH_3[2] * y * (4 * zz - xx - yy)
+    basis[12] = SH_3[3] * z * (2 * zz - 3 * xx - 3 * yy)
+    basis[13] = -SH_3[2] * x * (4 * zz - xx - yy)
+    basis[14], basis[15] = SH_3[4] * z * (xx - yy), -SH_3[0] * x * (xx - 3 * yy)
+
+
+@_compiled()
+def _draw_band(
+    x: np.ndarray,
+    y: np.ndarray,
+    shear: np.ndarray,
+    row_variance: np.ndarray,
+    y_variance: np.ndarray,
+    reach: np.ndarray,
+    first_row: np.ndarray,
+    rows: np.ndarray,
+    columns: np.ndarray,
+    paint: np.ndarray,
+    top: int,
+    sums: np.ndarray,  # [band rows, width, 5]
+) -> None:
+    """Blend the splats, nearest first, into the rows of the image from `top` on."""
+    band_rows, width, _ = sums.shape
+    transmittance = np.ones((band_rows, width))
+    still_open = band_rows * width
+    for splat in range(len(x)):
+        for row in range(max(first_row[splat], top), min(first_row[splat] + rows[splat], top + band_rows)):
+            dy = row + 0.5 - y[splat]
+            reach_here = max(reach[splat] - dy * dy / (2 * y_variance[splat]), 0.0)
+            centre = x[splat] + shear[splat] * dy
+            first, length = _span(centre, np.sqrt(2 * reach_here * row_variance[splat]), width)
+            distance = np.float32(first + 0.5 - centre)
+            sharpness = np.float32(np.sqrt(0.5 / row_variance[splat]))
+            log_peak = np.float32(reach_here + LOG_MIN_ALPHA)
+            for step in range(length):
+                before = transmittance[row - top, first + step]
+                if before == CLOSED:
+                    continue
+                falloff = (distance + np.float32(step)) * sharpness
+                alpha = min(max(np.exp(log_peak - falloff * falloff), LOWEST_ALPHA), HIGHEST_ALPHA)
+                after = before * (np.float32(1) - alpha)
+                if after <= MIN_TRANSMITTANCE:  # one too many: it is not drawn
+                    transmittance[row - top, first + step] = CLOSED
+                    still_open -= 1
+                    continue
+                transmittance[row - top, first + step] = after
+                weight = alpha * np.float32(before)
+                pixel = sums[row - top, first + step]
+                for channel in range(4):
+                    pixel[channel] += weight * paint[splat, channel]
+                pixel[4] += weight
+        if still_open == 0:
+            break

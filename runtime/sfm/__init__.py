@@ -1,0 +1,1 @@
+"""Structure from motion: features, matches and camera poses from images alone."""

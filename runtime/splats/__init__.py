@@ -1,0 +1,1 @@
+"""Gaussians: their type, filters, point clouds and files."""

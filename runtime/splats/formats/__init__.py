@@ -1,0 +1,1 @@
+"""One module a splat format, and what the formats share."""

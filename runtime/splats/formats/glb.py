@@ -1,0 +1,228 @@
+"""Gaussians as binary glTF (.glb) with KHR_gaussian_splatting, ratified by Khronos in 2026, all in float32.
+
+Scales and opacities are as we have them, rotations xyzw, spherical harmonics an attribute for each coefficient. The
+frame is glTF's (x left, y up, z forward), so a scene is turned by half around z. COLOR_0 shows coloured points to
+viewers that know no splats. Nothing is lost but the length of the quaternions, which are stored as unit ones.
+"""
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import InputError, refuse
+from ...geometry.quaternions import unit_quaternions
+from ...images.writing import linear_colours, to_bytes
+from ...system.files import check_expansion, read_bytes, replacing
+from ..axes import GLTF, half_turned
+from ..gaussians import Gaussians, bytes_in_memory, check_finite, check_ranges
+from .ply_header import OFFSET, checked_offset
+
+EXTENSION = "KHR_gaussian_splatting"
+PREFIX = EXTENSION + ":"
+HEADER = struct.Struct("<4sII")  # magic, version, length
+CHUNK = struct.Struct("<I4s")  # length, type
+MAGIC, VERSION = b"glTF", 2
+JSON, BINARY = b"JSON", b"BIN\0"
+EXPECTED = "a binary glTF file with splats (.glb)"
+
+FLOATS, UNSIGNED_BYTE = {"componentType": 5126}, 5121
+# What the extension allows for its attributes, and how far normalised integers reach.
+COMPONENTS = {5120: ("<i1", 127), 5121: ("<u1", 255), 5122: ("<i2", 32767), 5123: ("<u2", 65535), 5126: ("<f4", 1)}
+WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+POINTS = 0
+# What a node may say without moving anything.
+STANDING_STILL = {
+    "matrix": np.eye(4).ravel().tolist(),
+    "rotation": [0, 0, 0, 1],
+    "scale": [1, 1, 1],
+    "translation": [0, 0, 0],
+}
+ARRAY_BUFFER = 34962
+
+
+def write_glb(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None) -> list[str]:
+    """Write Gaussians as a .glb; the file appears whole or not at all.
+
+    offset: what was subtracted from the world coordinates, [3], in the scene's own axes, which the extras of the node
+    record: as its translation it would be rounded to float32.
+    Returns no line, since nothing is lost. Raises InputError if a value is not finite or not in our units, or the file
+    cannot be written.
+    """
+    check_ranges(path, gaussians)
+    check_finite(path, gaussians)
+    if not len(gaussians):
+        raise InputError(f"cannot write {path}: there are no Gaussians, and glTF knows nothing empty; write a .ply")
+    turned = half_turned(gaussians, GLTF)
+    attributes = {
+        "POSITION": turned.means,
+        "COLOR_0": to_bytes(np.column_stack([linear_colours(turned.colours), turned.opacities])),
+        PREFIX + "ROTATION": np.roll(unit_quaternions(turned.quats), -1, axis=1),
+        PREFIX + "SCALE": turned.scales,
+        PREFIX + "OPACITY": turned.opacities,
+    }
+    names = _coefficients(turned.sh_degree)
+    attributes |= {name: turned.sh[:, index] for index, name in enumerate(names)}
+    content = _document(attributes)
+    if offset is not None and offset.any():
+        content["nodes"][0]["extras"] = {OFFSET: offset.tolist()}
+    document = json.dumps(content, separators=(",", ":")).encode()
+    document += b" " * (-len(document) % 4)
+    size = sum(values.nbytes for values in attributes.values())
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        file.write(HEADER.pack(MAGIC, VERSION, HEADER.size + 2 * CHUNK.size + len(document) + size))
+        file.write(CHUNK.pack(len(document), JSON) + document + CHUNK.pack(size, BINARY))
+        for values in attributes.values():
+            file.write(np.ascontiguousarray(values).data)
+    return []
+
+
+def read_glb(path: Path) -> Gaussians:
+    """Read a .glb with one cloud of splats; raises InputError if the file cannot be read, has none, or is damaged."""
+    document, binary = _chunks(path, read_bytes(path, EXPECTED))
+    try:
+        gaussians = _read_gaussians(path, document, binary)
+    except InputError:
+        raise
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        refuse(path, f"not glTF as it should be ({type(error).__name__}: {str(error)[:60]})", "write it again")
+    check_finite(path, gaussians)
+    if (gaussians.scales < 0).any() or ((gaussians.opacities < 0) | (gaussians.opacities > 1)).any():
+        refuse(path, "negative scales, or opacities outside 0 to 1", "write it again")
+    return half_turned(gaussians, GLTF)
+
+
+def glb_offset(path: Path) -> np.ndarray:
+    """What a .glb says was subtracted from its coordinates, in the scene's own axes, float64 [3]; else zeros.
+
+    Raises InputError as `read_glb`.
+    """
+    document, _ = _chunks(path, read_bytes(path, EXPECTED))
+    nodes = document.get("nodes")
+    extras = [node.get("extras") for node in nodes if isinstance(node, dict)] if isinstance(nodes, list) else []
+    found = [extra[OFFSET] for extra in extras if isinstance(extra, dict) and OFFSET in extra]
+    return checked_offset(path, found[0]) if found else np.zeros(3)
+
+
+def _read_gaussians(path: Path, document: dict[str, Any], binary: bytes) -> Gaussians:
+    """The Gaussians in glTF's frame; raises InputError, or KeyError and the like where the JSON is not as it should."""
+    attributes = _splat_attributes(path, document)
+    count = document["accessors"][attributes["POSITION"]]["count"]
+    degree = max(d for d in range(4) if set(_coefficients(d)) <= set(attributes))
+
+    def read(name: str, kind: str) -> np.ndarray:
+        values = _read_accessor(path, document, binary, attributes[name], kind)
+        if len(values) != count:
+            refuse(path, f"{len(values)} values of {name} for {count} splats", "write it again")
+        return values
+
+    means = read("POSITION", "VEC3")
+    check_expansion(path, bytes_in_memory(count, degree), len(binary))  # accessors may share their bytes
+    return Gaussians(
+        means=means,
+        scales=read(PREFIX + "SCALE", "VEC3"),
+        quats=np.roll(read(PREFIX + "ROTATION", "VEC4"), 1, axis=1),
+        opacities=read(PREFIX + "OPACITY", "SCALAR")[:, 0],
+        sh=np.stack([read(name, "VEC3") for name in _coefficients(degree)], axis=1),
+    )
+
+
+def _coefficients(degree: int) -> list[str]:
+    """Attributes of the spherical harmonics up to a degree, in our order."""
+    return [f"{PREFIX}SH_DEGREE_{d}_COEF_{index}" for d in range(degree + 1) for index in range(2 * d + 1)]
+
+
+def _document(attributes: dict[str, np.ndarray]) -> dict[str, Any]:
+    """The JSON that says what the arrays are, which lie one behind the other."""
+    views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
+    offset = 0
+    for values in attributes.values():
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": values.nbytes, "target": ARRAY_BUFFER})
+        offset += values.nbytes
+        width = values.shape[1] if values.ndim == 2 else 1
+        kind = next(name for name, parts in WIDTHS.items() if parts == width)
+        number = {"componentType": UNSIGNED_BYTE, "normalized": True} if values.dtype == np.uint8 else FLOATS
+        accessors.append({"bufferView": len(accessors), "count": len(values), "type": kind, **number})
+    positions = attributes["POSITION"]
+    accessors[0] |= {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
+    splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    primitive = {
+        "attributes": {name: index for index, name in enumerate(attributes)},
+        "mode": POINTS,
+        "extensions": {EXTENSION: splats},
+    }
+    return {
+        "asset": {"version": "2.0", "generator": "idesplat"},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "buffers": [{"byteLength": offset}],
+        "bufferViews": views,
+        "accessors": accessors,
+    }
+
+
+def _chunks(path: Path, content: bytes) -> tuple[dict[str, Any], bytes]:
+    """The JSON document and the binary chunk."""
+    if not content.startswith(MAGIC):
+        refuse(path, "not a .glb file (it does not begin with 'glTF')", f"expected {EXPECTED}")
+    if len(content) < HEADER.size + CHUNK.size or HEADER.unpack_from(content)[2] > len(content):
+        refuse(path, "cut short", "copy or download it again")
+    chunks: dict[bytes, bytes] = {}
+    offset = HEADER.size
+    while offset + CHUNK.size <= len(content):
+        length, kind = CHUNK.unpack_from(content, offset)
+        offset += CHUNK.size
+        chunks.setdefault(kind, content[offset : offset + length])
+        offset += length
+    try:
+        document = json.loads(chunks.get(JSON, b""))
+    except (ValueError, RecursionError):
+        refuse(path, "its JSON cannot be read", "copy or download it again")
+    if not isinstance(document, dict):
+        refuse(path, "its JSON is no glTF", "write it again")
+    return document, chunks.get(BINARY, b"")
+
+
+def _splat_attributes(path: Path, document: dict[str, Any]) -> dict[str, int]:
+    """Attributes of the one primitive with splats, each the index of its accessor."""
+    primitives = [part for mesh in document.get("meshes", []) for part in mesh["primitives"]]
+    splats = [part for part in primitives if EXTENSION in part.get("extensions", {})]
+    if len(splats) != 1:
+        what = f"{len(splats)} clouds of splats ({EXTENSION})"
+        refuse(path, what, "expected one; a mesh or point cloud holds no Gaussians")
+    if splats[0]["extensions"][EXTENSION].get("extensions"):
+        refuse(path, "the splats are compressed by a further extension", "write it without")
+    for node in document.get("nodes", []):
+        if any(node.get(name, still) != still for name, still in STANDING_STILL.items()):
+            refuse(path, "a node moves or turns the splats", "write it with the transformation applied")
+    attributes = splats[0]["attributes"]
+    needed = ["POSITION", PREFIX + "ROTATION", PREFIX + "SCALE", PREFIX + "OPACITY", *_coefficients(0)]
+    missing = [name for name in needed if name not in attributes]
+    if missing:
+        refuse(path, f"the splats have no {', '.join(missing)}", "write it again")
+    return attributes
+
+
+def _read_accessor(path: Path, document: dict[str, Any], binary: bytes, index: int, kind: str) -> np.ndarray:
+    """One array of the document as float32 [count, parts]."""
+    accessor = document["accessors"][index]
+    if accessor["type"] != kind or "sparse" in accessor:
+        refuse(path, f"accessor {index} is {accessor['type']}", f"expected {kind} without sparse values")
+    view = document["bufferViews"][accessor["bufferView"]]
+    if view["buffer"] != 0 or "uri" in document["buffers"][0]:
+        refuse(path, f"accessor {index} lies outside the file", "write all in one .glb")
+    name, highest = COMPONENTS[accessor["componentType"]]
+    number, parts = np.dtype(name), WIDTHS[kind]
+    stride = view.get("byteStride", number.itemsize * parts)
+    start, count = view.get("byteOffset", 0) + accessor.get("byteOffset", 0), accessor["count"]
+    end = start + (count - 1) * stride + number.itemsize * parts
+    if min(start, count - 1, stride - number.itemsize * parts, len(binary) - end) < 0:
+        refuse(path, f"cut short: accessor {index} needs {end} bytes of {len(binary)}", "copy or download it again")
+    values = np.ndarray((count, parts), number, binary, start, (stride, number.itemsize)).astype(np.float32)
+    return np.maximum(values / highest, -1) if accessor.get("normalized") else values

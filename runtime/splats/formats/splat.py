@@ -1,0 +1,54 @@
+"""Gaussians as .splat files, which the first viewers in browsers read: 32 bytes each and no header.
+
+Position and scales as float32, colour and opacity in 8 bits each, the rotation as a wxyz quaternion in 8 bits a part
+around 128. The frame is the one of .ply files. Colours and opacities come back within 1/510 and the parts of the unit
+quaternion within 1/64; colours outside [0, 1] are clipped, and there are no spherical harmonics above degree 0.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import refuse
+from ...geometry.quaternions import unit_quaternions
+from ...system.files import read_bytes, replacing
+from ..gaussians import Gaussians, check_finite, check_ranges, with_colours
+from .quantization import moved, nearest_bytes
+
+RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
+ZERO, ONE = 128, 128  # of the rotation's bytes
+
+
+def write_splat(path: Path, gaussians: Gaussians) -> list[str]:
+    """Write Gaussians as a .splat; the file appears whole or not at all.
+
+    Returns a line for each thing that the format cannot hold. Raises InputError if a value is not finite or not in our
+    units, or the file cannot be written.
+    """
+    check_ranges(path, gaussians)
+    check_finite(path, gaussians)
+    records = np.empty(len(gaussians), RECORD)
+    records["mean"] = gaussians.means
+    records["scale"] = gaussians.scales
+    records["rgba"][:, :3] = nearest_bytes(gaussians.colours * 255)
+    records["rgba"][:, 3] = nearest_bytes(gaussians.opacities * 255)
+    records["quat"] = nearest_bytes(unit_quaternions(gaussians.quats) * ONE + ZERO)
+    with replacing(path) as temporary:
+        temporary.write_bytes(records.tobytes())
+    lost = ["spherical harmonics above degree 0 left out"] if gaussians.sh_degree else []
+    return lost + moved("colours", gaussians.colours, 0, 1)
+
+
+def read_splat(path: Path) -> Gaussians:
+    """Read a .splat; raises InputError if the file cannot be read, is not one, or holds a value that is none."""
+    content = read_bytes(path, "a splat file (.splat)")
+    if len(content) % RECORD.itemsize:
+        refuse(path, f"{len(content)} bytes long", "a .splat has 32 bytes for each Gaussian; copy or download it again")
+    records = np.frombuffer(content, RECORD)
+    if (records["scale"] < 0).any():
+        refuse(path, "negative scales", "expected standard deviations; it is not a .splat file, or damaged")
+    rgba = records["rgba"] / np.float32(255)
+    quats = unit_quaternions((records["quat"] - np.float32(ZERO)) / ONE)
+    gaussians = with_colours(records["mean"], records["scale"], quats, rgba[:, 3], rgba[:, :3])
+    check_finite(path, gaussians)
+    return gaussians

@@ -1,0 +1,144 @@
+"""Gaussians as .spz files (Niantic), some ten times smaller than .ply.
+
+Version 3 is written, a gzip stream; 2 to 4 are read. A header, then all positions, opacities, colours, scales,
+rotations and spherical harmonics. The frame is OpenGL's (x right, y up, z backward), so a scene is turned by half
+around x.
+
+positions: 24 bits each, as many of them behind the point as the scene's extent leaves: within 2^-23 of the largest
+coordinate or 2^-25 units, whichever is larger. opacities: 8 bits, within 1/510. colours: 8 bits, within 1/271 from
+-0.44 to 1.44. scales: 8 bits of the logarithm, within 3.2 %, from 4.5e-5 to 379. rotations: 10 bits for each of the
+smallest three parts of the quaternion, each within 7e-4 (version 2: 8 bits for each of x, y and z). spherical harmonics
+of degree 1 to 3: 8 bits, within 1/256 from -1 to 0.996.
+"""
+
+import zlib
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import refuse
+from ...geometry.quaternions import from_smallest_three, smallest_three, unit_quaternions
+from ...geometry.sh import SH_0
+from ...system.files import read_bytes, replacing
+from ..axes import OPENGL, half_turned
+from ..gaussians import Gaussians, check_finite, check_ranges
+from .quantization import moved, nearest_bytes
+from .spz_container import EXPECTED, HEADER, MAGIC, MOST_FRACTIONAL_BITS, unpack
+
+VERSION = 3  # to write: version 4 is not read everywhere yet
+
+POSITION_LIMIT = (1 << 23) - 1  # of 24 bits with a sign
+LOG_SCALE_STEPS, LOG_SCALE_OFFSET = 16, 10  # byte = (log scale + 10) * 16
+COLOUR_STEPS = 0.15 * 255  # byte = sh * steps + 127.5: the range is wider than that of colours
+SH_STEPS = 128  # byte = sh * 128 + 128
+SH_HIGHEST = 127.5 / 128  # rounded, the highest byte
+QUAT_STEPS = 511 / np.sqrt(0.5)  # magnitude of a smallest part in 9 bits; the tenth is its sign
+
+
+def write_spz(path: Path, gaussians: Gaussians) -> list[str]:
+    """Write Gaussians as a .spz; the file appears whole or not at all.
+
+    Returns a line for each thing that the format cannot hold. Raises InputError if a value is not finite or not in our
+    units, the scene is larger than the format, or the file cannot be written.
+    """
+    check_ranges(path, gaussians)
+    check_finite(path, gaussians)
+    turned = half_turned(gaussians, OPENGL)
+    bits = _fractional_bits(path, turned.means)
+    rest = turned.sh[:, 1:]
+    with np.errstate(divide="ignore"):
+        log_scales = np.log(turned.scales)
+    parts = [
+        HEADER.pack(MAGIC, VERSION, len(turned), turned.sh_degree, bits, 0, 0),
+        _pack_positions(turned.means, bits),
+        nearest_bytes(turned.opacities * 255),
+        nearest_bytes(turned.sh[:, 0] * COLOUR_STEPS + 127.5),
+        nearest_bytes((log_scales + LOG_SCALE_OFFSET) * LOG_SCALE_STEPS),
+        _pack_rotations(turned.quats),
+        nearest_bytes(rest * SH_STEPS + SH_STEPS),
+    ]
+    compressor = zlib.compressobj(wbits=31)  # gzip's header and trailer
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        for part in parts:
+            file.write(compressor.compress(part if isinstance(part, bytes) else np.ascontiguousarray(part).data))
+        file.write(compressor.flush())
+    highest = np.exp(255 / LOG_SCALE_STEPS - LOG_SCALE_OFFSET)
+    notes = moved("scales", turned.scales, np.exp(-LOG_SCALE_OFFSET), highest)
+    notes += moved("spherical harmonics", rest, -1, SH_HIGHEST)
+    return notes + moved("colours", gaussians.colours, *_colour_range())
+
+
+def read_spz(path: Path) -> Gaussians:
+    """Read a .spz; raises InputError if the file cannot be read, is not one we know, or is damaged."""
+    header, body = unpack(path, read_bytes(path, EXPECTED))
+    count, coefficients = header.gaussians, (header.sh_degree + 1) ** 2
+    fields, start = [], 0
+    for size in header.sizes:
+        fields.append(np.frombuffer(body, np.uint8, count * size, start).reshape(count, size))
+        start += count * size
+    positions, opacities, colours, scales, rotations, rest = fields
+    sh = np.empty((count, coefficients, 3), np.float32)
+    sh[:, 0] = (colours - np.float32(127.5)) / COLOUR_STEPS
+    sh[:, 1:] = (rest.reshape(count, coefficients - 1, 3) - np.float32(SH_STEPS)) / SH_STEPS
+    unpack_rotations = _unpack_version_2_rotations if header.version == 2 else _unpack_rotations
+    gaussians = Gaussians(
+        means=_unpack_positions(positions, header.fractional_bits),
+        scales=np.exp(scales / np.float32(LOG_SCALE_STEPS) - LOG_SCALE_OFFSET),
+        quats=unpack_rotations(rotations),
+        opacities=opacities[:, 0] / np.float32(255),
+        sh=sh,
+    )
+    return half_turned(gaussians, OPENGL)
+
+
+def _fractional_bits(path: Path, means: np.ndarray) -> int:
+    """As many bits behind the point as the largest coordinate leaves of 24."""
+    largest = float(np.abs(means).max(initial=0))
+    if largest > POSITION_LIMIT:
+        refuse(path, f"the scene reaches {largest:g} units", f"a .spz holds {POSITION_LIMIT}; write a .ply instead")
+    bits = MOST_FRACTIONAL_BITS
+    while round(largest * 2**bits) > POSITION_LIMIT:
+        bits -= 1
+    return bits
+
+
+def _pack_positions(means: np.ndarray, bits: int) -> np.ndarray:
+    """Fixed-point numbers in three bytes, the lowest first."""
+    fixed = np.rint(means.astype(np.float64) * 2**bits).astype("<i4", order="C")
+    return fixed.view(np.uint8).reshape(-1, 3, 4)[..., :3]
+
+
+def _unpack_positions(packed: np.ndarray, bits: int) -> np.ndarray:
+    fixed = np.zeros((len(packed), 3, 4), np.uint8)
+    fixed[..., 1:] = packed.reshape(-1, 3, 3)  # in the upper bytes, so that the shift down repeats the sign
+    return ((fixed.view("<i4")[..., 0] >> 8) / 2**bits).astype(np.float32)
+
+
+def _pack_rotations(quats: np.ndarray) -> np.ndarray:
+    """Which part of xyzw is the largest in 2 bits, then sign and magnitude of the others in order, 10 bits each."""
+    largest, others = smallest_three(np.roll(unit_quaternions(quats), -1, axis=1))
+    packed = largest.astype("<u4")
+    for part in others.T:
+        magnitude = np.rint(np.abs(part) * QUAT_STEPS).astype("<u4")
+        packed = packed << 10 | (part < 0).astype("<u4") << 9 | magnitude
+    return packed.astype("<u4").view(np.uint8).reshape(-1, 4)
+
+
+def _unpack_rotations(packed: np.ndarray) -> np.ndarray:
+    words = np.ascontiguousarray(packed).view("<u4")[:, 0]
+    fields = np.stack([words >> 20, words >> 10, words], axis=1) & 0x3FF
+    others = (fields & 0x1FF) / QUAT_STEPS * np.where(fields & 0x200, -1, 1)
+    return np.roll(from_smallest_three(words >> 30, others), 1, axis=1)
+
+
+def _unpack_version_2_rotations(packed: np.ndarray) -> np.ndarray:
+    """Version 2 keeps x, y and z in 8 bits each; w is positive."""
+    xyz = packed / np.float32(127.5) - 1
+    w = np.sqrt(np.maximum(1 - np.square(xyz).sum(axis=1, keepdims=True), 0))
+    return np.concatenate([w, xyz], axis=1)
+
+
+def _colour_range() -> tuple[float, float]:
+    """Colours whose bytes are 0 and 255."""
+    reach = SH_0 * 127.5 / COLOUR_STEPS
+    return 0.5 - reach, 0.5 + reach

@@ -1,0 +1,99 @@
+"""Coloured points and surfaces: a point for each pixel, where its depth puts it, or for each Gaussian.
+
+Written by trimesh as .ply, .obj and .glb, in the frame that they have, except for .glb: glTF's axes are x left, y up,
+z forward, so that is turned by half around z, and its colours are linear. `.xyz` is a line of x y z r g b for each.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..images.writing import linear_colours, to_bytes
+from ..system.files import replacing
+from .axes import GLTF
+from .gaussians import Gaussians
+
+# What `write_point_cloud` and `write_mesh` know to write.
+POINT_SUFFIXES = (".ply", ".glb", ".obj", ".xyz")
+MESH_SUFFIXES = (".ply", ".glb", ".obj")
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Points with colours.
+
+    positions: world units and axes of the cameras given, float32 [points, 3].
+    colours: RGB, uint8 [points, 3].
+    """
+
+    positions: np.ndarray
+    colours: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+
+def points_from_depth(
+    depth: np.ndarray, images: np.ndarray, extrinsics: np.ndarray, intrinsics: np.ndarray
+) -> PointCloud:
+    """Every pixel's centre at its depth, in its colour, ordered by view, row, column.
+
+    depth: z-depth in world units, [views, height, width]. images: RGB in [0, 1], [views, 3, height, width].
+    extrinsics: camera-to-world, OpenCV axes, [views, 4, 4]. intrinsics: normalised by width and height, [views, 3, 3].
+    """
+    positions = unproject(depth, extrinsics, intrinsics)
+    colours = to_bytes(images).transpose(0, 2, 3, 1)
+    return PointCloud(positions.reshape(-1, 3).astype(np.float32), colours.reshape(-1, 3))
+
+
+def unproject(depth: np.ndarray, extrinsics: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    """Where every pixel's centre lies in the world, [views, height, width, 3] float64; arguments as above."""
+    views, height, width = depth.shape
+    x, y = (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
+    pixels = np.stack([*np.meshgrid(x, y), np.ones((height, width))], axis=-1).reshape(-1, 3)
+    rays = pixels @ np.linalg.inv(intrinsics.astype(np.float64)).swapaxes(1, 2)  # [views, height * width, 3], z = 1
+    points = rays * depth.reshape(views, -1, 1)
+    return (points @ extrinsics[:, :3, :3].swapaxes(1, 2) + extrinsics[:, None, :3, 3]).reshape(*depth.shape, 3)
+
+
+def points_from_gaussians(gaussians: Gaussians) -> PointCloud:
+    """The centre of every Gaussian, in the colour that it has from all sides."""
+    return PointCloud(gaussians.means, to_bytes(gaussians.colours))
+
+
+def write_point_cloud(path: Path, cloud: PointCloud) -> None:
+    """Write points in the form of the path's suffix; raises InputError if the file cannot be written."""
+    import trimesh
+
+    with replacing(path) as temporary:
+        if path.suffix.lower() == ".xyz":
+            np.savetxt(temporary, np.column_stack([cloud.positions, cloud.colours]), "%.9g %.9g %.9g %d %d %d")
+        else:
+            positions, colours = _in_form(path, cloud)
+            _export(trimesh.PointCloud(positions, colors=colours), temporary)
+
+
+def write_mesh(path: Path, cloud: PointCloud, faces: np.ndarray) -> None:
+    """Write a surface, its corners coloured, in the form of the path's suffix; raises InputError as above.
+
+    faces: three indices of points each, anticlockwise as seen from the front, [faces, 3].
+    """
+    import trimesh
+
+    positions, colours = _in_form(path, cloud)
+    with replacing(path) as temporary:
+        _export(trimesh.Trimesh(positions, faces, vertex_colors=colours, process=False), temporary)
+
+
+def _in_form(path: Path, cloud: PointCloud) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and colours as the path's format wants them."""
+    if path.suffix.lower() != ".glb":
+        return cloud.positions, cloud.colours
+    return cloud.positions * np.array(GLTF, np.float32), to_bytes(linear_colours(cloud.colours / 255))
+
+
+def _export(geometry: Any, temporary: Path) -> None:
+    content = geometry.export(file_type=temporary.suffix[1:].lower())
+    temporary.write_bytes(content if isinstance(content, bytes) else content.encode())

@@ -1,0 +1,1 @@
+"""Files, limits, the cache folder and progress."""

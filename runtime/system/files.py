@@ -1,0 +1,228 @@
+"""Files: read only where they are regular ones, written so that they appear whole or not at all."""
+
+import os
+import re
+import shutil
+import stat
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from pathlib import Path
+from typing import BinaryIO, Protocol
+
+from ..errors import InputError, refuse
+from .limits import EXPANSION
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
+# What small files may take in memory, however well they are compressed.
+ALWAYS_ALLOWED = 1 << 26  # bytes
+SCRATCH_PREFIX = ".idesplat-tmp-"
+SCRATCH_NAME = re.compile(re.escape(SCRATCH_PREFIX) + r"\w{8}")  # as tempfile.mkdtemp completes it
+LOCK_NAME = ".idesplat-lock"
+KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a named pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+}
+
+_collected: set[Path] = set()
+
+
+class WriteGuard(Protocol):
+    """What a running command asks before a file is written, and notes afterwards (see `outputs`)."""
+
+    def check(self, path: Path) -> None:
+        """Raise InputError where the file must not be written; create its folder where that is missing."""
+
+    def written(self, path: Path) -> None:
+        """Take note of a file that has just been written."""
+
+
+GUARD: ContextVar[WriteGuard | None] = ContextVar("GUARD", default=None)
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield a temporary path of the same name that replaces `path` once the block ends without an exception.
+
+    A killed run leaves the old file or the new one, never half of one.
+    Raises InputError if the folder cannot be written, or the running command must not replace the file.
+    """
+    path, guard = Path(path), GUARD.get()
+    if guard is not None:
+        guard.check(path)
+    try:
+        with scratch_folder(path.parent) as folder:
+            temporary = folder / path.name
+            yield temporary
+            temporary.replace(path)
+        if guard is not None:
+            guard.written(path)
+    except OSError as error:
+        reason = f"cannot write {path}: {error.strerror or error}"
+        raise InputError(f"{reason}; choose a folder that exists, is writable and has room for it") from None
+
+
+@contextmanager
+def scratch_folder(parent: Path | None = None) -> Iterator[Path]:
+    """Yield a new folder in `parent`, or in the system's folder for temporary files, that is removed after the block.
+
+    Folders of this kind that killed processes left in `parent` are removed first, once for each process and parent. A
+    process locks its folder, and the system releases the lock when the process ends: a folder in use is never removed.
+    Raises OSError if the folder cannot be made.
+    """
+    parent = Path(parent or tempfile.gettempdir())
+    collect_abandoned(parent)
+    folder, lock = _make_locked(parent)
+    try:
+        yield folder
+    finally:
+        if lock is not None:
+            os.close(lock)  # before the file is removed: NFS and Windows keep files that are open
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def collect_abandoned(parent: Path) -> None:
+    """Remove the scratch folders that killed processes of this user left in `parent`; only when first asked to."""
+    if fcntl is None or parent in _collected:
+        return
+    _collected.add(parent)
+    with suppress(OSError), os.scandir(parent) as entries:
+        for entry in entries:
+            if SCRATCH_NAME.fullmatch(entry.name):
+                with suppress(OSError):
+                    _remove_if_abandoned(entry)
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """Open a regular file for reading in binary.
+
+    A named pipe would block for ever, and a device may have no end: InputError is raised for what is no regular file.
+    Raises OSError as `open` does.
+    """
+    check_regular(path)
+    # Between the check and the opening another file may take the name: not blocking, and checked once more.
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    try:
+        _check_kind(path, os.fstat(descriptor))
+        return os.fdopen(descriptor, "rb")
+    except BaseException:
+        os.close(descriptor)
+        raise
+
+
+def check_regular(path: Path) -> None:
+    """Raise InputError for what exists and is no regular file, before a library opens it by its name.
+
+    Raises OSError if there is no such file.
+    """
+    try:
+        status = os.stat(path)
+    except ValueError:  # NUL and lone surrogates
+        refuse(path, "is no name that a file can have", "give the path of a file")
+    _check_kind(path, status)
+
+
+def read_bytes(path: Path, expected: str, largest: int | None = None) -> bytes:
+    """The content of a regular file; raises InputError, naming what was expected, if it cannot be read, or is empty.
+
+    largest: bytes from which on it cannot be what was expected, either.
+    """
+    path = Path(path)
+    try:
+        with open_regular(path) as file:
+            size = os.fstat(file.fileno()).st_size
+            if largest is not None and size > largest:
+                refuse(path, f"has {size >> 20} MiB", f"expected {expected}")
+            content = file.read()
+    except OSError as error:
+        refuse(path, f"cannot be read ({error.strerror})", f"expected {expected}")
+    except MemoryError:
+        refuse(path, f"has {size >> 20} MiB, more than memory has room for", f"expected {expected}")
+    if not content:
+        refuse(path, "is empty", f"expected {expected}")
+    return content
+
+
+def check_expansion(path: Path, unpacked: int, packed: int) -> None:
+    """Refuse a file of `packed` bytes that claims to hold so many more, before they take memory."""
+    if unpacked > max(ALWAYS_ALLOWED, EXPANSION.value * packed):
+        raise InputError(
+            f"{path}: {packed} bytes that claim to hold {unpacked} are no scene; copy or download it again, or "
+            f"{EXPANSION.remedy}"
+        )
+
+
+def make_folder(path: Path) -> Path:
+    """Create `path` and its parents; raises InputError where that is not possible."""
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot create the folder {path}: {error.strerror}; choose another output folder") from None
+    return Path(path)
+
+
+def check_writable(folder: Path) -> None:
+    """Raise InputError unless files can be written into an existing folder; to be asked before long work."""
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(f"cannot write into {folder}: {error.strerror}; choose a folder that exists") from None
+
+
+def _check_kind(path: Path, status: os.stat_result) -> None:
+    if not stat.S_ISREG(status.st_mode):
+        kind = KINDS.get(stat.S_IFMT(status.st_mode), "no regular file")
+        refuse(path, f"is {kind}", "expected a regular file; save what it holds to one")
+
+
+def _make_locked(parent: Path) -> tuple[Path, int | None]:
+    """A new folder with a locked file in it, and that file's descriptor; None where the system has no such locks."""
+    while True:
+        folder = Path(tempfile.mkdtemp(prefix=SCRATCH_PREFIX, dir=parent))
+        if fcntl is None:
+            return folder, None
+        try:
+            lock = os.open(folder / LOCK_NAME, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        except FileNotFoundError:  # another process took the folder for an abandoned one, before there was a lock
+            continue
+        except BaseException:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+        if _lock(lock) is not False and (folder / LOCK_NAME).exists():
+            return folder, lock
+        os.close(lock)
+
+
+def _lock(descriptor: int) -> bool | None:
+    """Whether the file is this process's own from now on; None where the file system has no locks."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return None
+    return True
+
+
+def _remove_if_abandoned(entry: os.DirEntry[str]) -> None:
+    if not entry.is_dir(follow_symlinks=False) or entry.stat(follow_symlinks=False).st_uid != os.getuid():
+        return
+    try:
+        lock = os.open(Path(entry.path, LOCK_NAME), os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except FileNotFoundError:
+        os.rmdir(entry.path)  # its process was killed, or is about to lock it and will then make another one
+        return
+    try:
+        if _lock(lock):
+            shutil.rmtree(entry.path, ignore_errors=True)
+    finally:
+        os.close(lock)

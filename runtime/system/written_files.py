@@ -1,0 +1,102 @@
+"""Which files were written by a command of ours, so that a later one may replace these and no others.
+
+A record in the user's cache folder names the files of one output folder, each with its size and the time of its last
+change. It holds for every format alike. A mark inside the file would not: .splat and .xyz have no room for one, an
+edited file would keep it, and a rendered image saved again by an editor would lose or keep it as the editor likes.
+Whatever was changed, copied or moved since, and whatever is not in the record because that was deleted, counts as
+somebody else's: the error is always on the side of keeping a file.
+"""
+
+import hashlib
+import json
+import os
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+from .cache_folder import cache_folder
+from .files import scratch_folder
+
+KEY_LENGTH = 32  # hexadecimal digits
+SUFFIX = ".jsonl"
+LEAST_STALE_LINES = 1000  # below which a record is not rewritten without them
+MOST_RECORDS = 2000  # folders that are remembered; those not written to for longest are forgotten
+
+
+class WrittenFile(NamedTuple):
+    """A file as the command left it. changed_ns: time of its last change in nanoseconds."""
+
+    command: str
+    size: int
+    changed_ns: int
+
+
+def read_record(folder: Path) -> dict[str, WrittenFile]:
+    """The files that commands have written into a folder, by name; none where there is no record."""
+    found: dict[str, WrittenFile] = {}
+    lines: list[str] = []
+    with suppress(OSError, RuntimeError):
+        record = _record_path(folder)
+        if record.is_file():  # a pipe would keep us waiting
+            lines = record.read_text("ascii", errors="replace").splitlines()
+    for line in lines:
+        # A line that was cut short, or damaged, is none.
+        with suppress(ValueError, TypeError, OverflowError, RecursionError):
+            name, command, size, changed_ns = json.loads(line)
+            if isinstance(name, str):
+                found[name] = WrittenFile(str(command), int(size), int(changed_ns))
+    if len(lines) > 2 * len(found) + LEAST_STALE_LINES:
+        _rewrite(folder, found)
+    return found
+
+
+def add_to_record(path: Path, command: str) -> None:
+    """Note that `command` has just written a file; where the cache folder cannot be written, nothing is noted."""
+    with suppress(OSError, RuntimeError):
+        status = path.lstat()
+        record = _record_path(path.parent)
+        if not record.exists():
+            record.parent.mkdir(parents=True, exist_ok=True)
+            _forget_oldest(record.parent)
+        elif not record.is_file():
+            return
+        line = _line(path.name, WrittenFile(command, status.st_size, status.st_mtime_ns))
+        with record.open("a", encoding="ascii") as file:
+            file.write(line)  # in one call, so that lines of several processes do not mix
+
+
+def matches(path: Path, entry: WrittenFile | None) -> bool:
+    """Whether a file is still what the record says of it."""
+    if entry is None:
+        return False
+    try:
+        status = path.lstat()
+    except OSError:
+        return False
+    return (status.st_size, status.st_mtime_ns) == (entry.size, entry.changed_ns)
+
+
+def _record_path(folder: Path) -> Path:
+    key = hashlib.sha256(os.fsencode(os.path.realpath(folder))).hexdigest()[:KEY_LENGTH]
+    return cache_folder("written") / (key + SUFFIX)
+
+
+def _line(name: str, entry: WrittenFile) -> str:
+    return json.dumps([name, *entry]) + "\n"
+
+
+def _rewrite(folder: Path, entries: dict[str, WrittenFile]) -> None:
+    """Replace a record by one without the lines that newer ones made void."""
+    with suppress(OSError, RuntimeError):
+        record = _record_path(folder)
+        with scratch_folder(record.parent) as scratch:
+            new = scratch / record.name
+            new.write_text("".join(_line(*item) for item in entries.items()), encoding="ascii")
+            new.replace(record)
+
+
+def _forget_oldest(records: Path) -> None:
+    """Remove the records that were not written to for longest, so that one more has room."""
+    by_age = sorted(records.glob(f"*{SUFFIX}"), key=lambda path: path.stat().st_mtime)
+    for path in by_age[: max(0, len(by_age) - MOST_RECORDS + 1)]:
+        path.unlink(missing_ok=True)

@@ -1,0 +1,1 @@
+"""Pages that show a scene in the browser."""

@@ -1,0 +1,1 @@
+"""Images brought together with their cameras, and the selection among them."""

@@ -1,0 +1,68 @@
+"""The sparse products that training and the export put in place of the network's own: the same values and gradients."""
+
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+from idesplat.export.graph.gather_loops import FEW, in_steps
+from idesplat.export.graph.nodes import names_read
+from idesplat.model.common import gather_attention as gathered
+from idesplat.model.common.gather_attention import SparseProducts
+from idesplat.tools.benchmark.matmuls import INPUTS, Both, exported
+from idesplat.tools.training import gather_attention as compiled
+
+PAIRS, CANDIDATES, PIXELS, CHANNELS = 4, 11, 30, 6
+BLOCK = 8
+
+
+def test_values_and_gradients_are_the_networks_own() -> None:
+    torch.manual_seed(0)
+    rows = torch.randint(0, PAIRS * PIXELS + 1, (PAIRS, CANDIDATES, PIXELS))  # the last row is of zeros
+    queries, weights = torch.randn(PAIRS, PIXELS, CHANNELS), torch.rand(PAIRS, CANDIDATES, PIXELS)
+    table = gathered.pixel_table(torch.randn(PAIRS, PIXELS, CHANNELS))
+    for name, left in (("correlate", queries), ("weigh", weights)):
+        results = []
+        for module in (gathered, compiled):
+            inputs = [part.clone().requires_grad_() for part in (left, table)]
+            product = getattr(module, name)(*inputs, rows)
+            gradients = torch.autograd.grad(product.square().sum(), inputs)
+            results.append((product, *gradients))
+        for expected, found in zip(*results, strict=True):
+            torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_exported_values_are_the_networks_own() -> None:
+    rng = np.random.default_rng(0)
+
+    def drawn(pairs: int, pixels: int) -> tuple[np.ndarray, ...]:
+        rows = rng.integers(0, 2 * pixels, (pairs, CANDIDATES, pixels), np.int32)
+        queries = rng.standard_normal((pairs, pixels, CHANNELS), np.float32)
+        return queries, rng.standard_normal((2 * pixels, CHANNELS), np.float32), rows
+
+    model = exported(BLOCK, drawn(2, 4 * BLOCK), steps=True)
+    onnx.checker.check_model(model, full_check=True)
+    assert [node.op_type for node in model.graph.node].count("Loop") == 2
+    assert {node.domain for node in model.graph.node} == {""}
+    names = [node.name for node in model.graph.node]
+    assert all(names) and len(set(names)) == len(names)
+    loops = [node for node in model.graph.node if node.op_type == "Loop"]
+    assert all("table" in names_read(node) and "table" not in node.input for node in loops)
+    session = onnxruntime.InferenceSession(model.SerializeToString())
+    for pairs, blocks in ((2, 4), (3, 10)):  # another number of both
+        arrays = drawn(pairs, blocks * BLOCK)
+        expected = Both(BLOCK)(*(torch.from_numpy(array) for array in arrays))
+        found = session.run(None, dict(zip(INPUTS, arrays, strict=True)))[0]
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_the_networks_own_are_put_back() -> None:
+    network = Both(BLOCK)
+    with in_steps(network):
+        assert network.products.correlate is not gathered.correlate
+    assert network.products.correlate is gathered.correlate and network.products.weigh is gathered.weigh
+
+
+def test_few_numbers_are_gathered_at_once() -> None:
+    products = SparseProducts(FEW - 1, BLOCK)
+    with in_steps(products):
+        assert products.correlate is gathered.correlate

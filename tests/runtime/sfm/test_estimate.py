@@ -1,0 +1,136 @@
+"""Cameras from photographs alone, held against the known cameras of a drawn room, and of real photographs."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from idesplat.runtime.cameras.io import read_cameras
+from idesplat.runtime.errors import InputError
+from idesplat.runtime.images.exif import exif_focal, given_focal
+from idesplat.runtime.images.io import load_image
+from idesplat.runtime.sfm.estimate import estimate_cameras
+from idesplat.tools.synthetic.make_scene import make_scene
+from PIL import Image
+
+FOX = Path(__file__).parent.parent.parent.parent.parent / "shared" / "scenes" / "fox"
+FOCAL_LENGTH_35MM = 0xA405  # EXIF 2.32
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    """Photographs of a drawn room, and their true cameras."""
+    folder = tmp_path_factory.mktemp("room")
+    make_scene(folder, seed=2, views=3, height=360, width=480)
+    cameras = read_cameras(folder / "transforms.json")
+    return [folder / camera.name for camera in cameras], cameras
+
+
+def relative_errors(found, known, first=0, second=1):
+    """Degrees between the relative rotations, and between the directions of translation."""
+    ours, theirs = (np.linalg.inv(cameras[second].extrinsics) @ cameras[first].extrinsics for cameras in (found, known))
+    turn = np.linalg.norm(cv2.Rodrigues(ours[:3, :3].T @ theirs[:3, :3])[0])
+    a, b = ours[:3, 3], theirs[:3, 3]
+    return np.degrees(turn), np.degrees(np.arccos(a @ b / np.linalg.norm(a) / np.linalg.norm(b)))
+
+
+def test_two_photographs(room):
+    pictures, known = room
+    found = estimate_cameras([pictures[0], pictures[2]], str(known[0].K[0, 0]))
+    rotation, direction = relative_errors(found, [known[0], known[2]])
+    assert rotation < 0.5 and direction < 3
+    assert [camera.name for camera in found] == [str(pictures[0]), str(pictures[2])]
+    np.testing.assert_array_equal(found[0].extrinsics, np.eye(4))
+    np.testing.assert_allclose(found[0].K, known[0].K, atol=1e-9)
+    # The unit is the median depth: the true one, in the true unit, tells the scale.
+    depth = np.load(pictures[0].parent.parent / "depth" / f"{pictures[0].stem}.npz")["depth"]
+    baseline = np.linalg.norm(known[2].extrinsics[:3, 3] - known[0].extrinsics[:3, 3])
+    scale = np.linalg.norm(found[1].extrinsics[:3, 3]) / baseline
+    assert 0.6 < np.median(depth) * scale < 1.6
+    near, far = found[0].depth_range
+    assert near < np.percentile(depth, 2) * scale and far > np.percentile(depth, 98) * scale
+
+
+def test_three_photographs_through_the_mapper(room):
+    pictures, known = room
+    for focal in (str(known[0].K[0, 0]), None):
+        found = estimate_cameras(pictures, focal)
+        assert [camera.name for camera in found] == [str(picture) for picture in pictures]
+        np.testing.assert_allclose(found[0].extrinsics, np.eye(4), atol=1e-12)
+        for i, j in ((0, 1), (0, 2), (1, 2)):
+            rotation, direction = relative_errors(found, known, i, j)
+            assert rotation < 2 and direction < 5
+        # The lengths of the steps are known up to one factor.
+        steps = [
+            np.linalg.norm(cameras[1].extrinsics[:3, 3] - cameras[0].extrinsics[:3, 3])
+            / np.linalg.norm(cameras[2].extrinsics[:3, 3] - cameras[1].extrinsics[:3, 3])
+            for cameras in (found, known)
+        ]
+        assert steps[0] == pytest.approx(steps[1], rel=0.1)
+        assert all(camera.depth_range is not None for camera in found)
+
+
+def test_exif_tells_the_focal_length(room, tmp_path):
+    pictures, known = room
+    width, height = known[0].width, known[0].height
+    film = round(known[0].K[0, 0] * np.hypot(36, 24) / np.hypot(width, height))
+    tagged = []
+    for picture in (pictures[0], pictures[2]):
+        image = Image.open(picture)
+        exif = image.getexif()
+        exif.get_ifd(0x8769)[FOCAL_LENGTH_35MM] = film
+        tagged.append(tmp_path / f"{picture.stem}.jpg")
+        image.save(tagged[-1], exif=exif, quality=98)
+    assert exif_focal(tagged[0], width, height) == pytest.approx(known[0].K[0, 0], rel=0.02)  # whole millimetres
+    assert exif_focal(pictures[0], width, height) is None
+    rotation, direction = relative_errors(estimate_cameras(tagged), [known[0], known[2]])
+    assert rotation < 2 and direction < 5
+
+
+def test_given_focal_lengths():
+    assert given_focal("1375.5", 1080, 1920) == 1375.5
+    assert given_focal("36mm", 3600, 2400) == pytest.approx(3600)  # 36 mm is as wide as the film
+    for text in ("", "mm", "-5", "0", "0mm", "26 cm", "1e3", "nan"):
+        with pytest.raises(InputError, match="expected pixels"):
+            given_focal(text, 100, 100)
+
+
+def save(path, rgb):
+    cv2.imwrite(str(path), np.ascontiguousarray(rgb[..., ::-1]))
+    return path
+
+
+def test_refusals(room, tmp_path, monkeypatch):
+    (first, second, _), (camera, *_) = room
+    focal = str(camera.K[0, 0])
+    image = load_image(first)
+    turned = camera.K @ cv2.Rodrigues(np.array([0.0, 0.06, 0.01]))[0] @ np.linalg.inv(camera.K)
+    rotated = save(tmp_path / "turned.png", cv2.warpPerspective(image, turned, image.shape[1::-1]))
+    blank = save(tmp_path / "blank.png", np.full_like(image, 128))
+    noise = save(tmp_path / "noise.png", np.random.default_rng(0).integers(0, 255, image.shape, np.uint8))
+    for pictures, given, expected in (
+        ([first], focal, "1 photograph given, expected two at least"),
+        ([first, second], None, "tells no focal length; give --focal"),
+        ([first, second], "wide", "--focal wide: expected pixels"),
+        ([first, second], "999999", r"000\.png: the focal lengths .* not plausible"),
+        ([first, first], focal, r"too nearly the same place: .*expected 1\.5 at least; step aside"),
+        ([first, rotated], focal, "too nearly the same place"),
+        ([first, blank], focal, "0 points found in both, expected 40 at least"),
+        ([first, noise], focal, "points found in both, expected"),
+        ([first, blank, noise], focal, "the 3 photographs do not fit together"),
+    ):
+        with pytest.raises(InputError, match=expected) as caught:
+            estimate_cameras(pictures, given)
+        assert "\n" not in str(caught.value)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"3 photographs need pycolmap \(pip install .*--frames"):
+        estimate_cameras([first, second, blank], focal)
+
+
+@pytest.mark.skipif(not FOX.is_dir(), reason="the real photographs are not carried by the project")
+def test_real_photographs():
+    known = {Path(camera.name).name: camera for camera in read_cameras(FOX / "transforms.json")}
+    pictures = [FOX / "images" / name for name in ("0001.jpg", "0008.jpg")]
+    found = estimate_cameras(pictures, "1375")
+    rotation, direction = relative_errors(found, [known[picture.name] for picture in pictures])
+    assert rotation < 2 and direction < 5

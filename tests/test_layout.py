@@ -1,0 +1,125 @@
+"""The repository's layout: boundaries between packages, no circles of imports, and every package in the wheel."""
+
+import ast
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PACKAGES = ("model", "export", "runtime", "tools")
+FORBIDDEN = {
+    "model": {"export", "runtime", "tools", "onnx", "onnxruntime", "cv2"},
+    "export": {"tools"},
+    "runtime": {"model", "export", "tools", "torch", "onnx", "onnxscript"},
+    "tools": set(),
+}
+# A package imports only what stands before it.
+ORDERS = {
+    "runtime": (
+        *("errors", "system", "startup", "geometry", "images", "cameras", "sfm", "views", "splats", "inference"),
+        *("rendering", "viewer", "cli"),
+    ),
+    "model": ("config", "common", "idesplat", "depthsplat", "registry", "checkpoint"),
+    "export": ("written", "graph", "stages", "room", "precision", "freeze", "validation", "pipeline", "cli"),
+    "tools": ("processes", "synthetic", "training", "evaluation", "benchmark", "figures"),
+}
+
+
+def modules() -> dict[str, Path]:
+    """Every module by its name below `idesplat`, such as `runtime.cameras.camera`."""
+    found = {}
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+def imports(name: str, path: Path, known: dict[str, Path]) -> Iterator[str]:
+    """The modules that one imports, also inside functions: ours by their name, others by their top level."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in _without_type_checking(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name.partition(".")[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = _absolute(node, name, path.name == "__init__.py")
+            if base is None:
+                yield str(node.module).partition(".")[0]
+                continue
+            for alias in node.names:
+                full = f"{base}.{alias.name}".lstrip(".")
+                yield full if full in known else base
+
+
+def _without_type_checking(tree: ast.AST) -> Iterator[ast.AST]:
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            continue
+        yield node
+        yield from _without_type_checking(node)
+
+
+def _absolute(node: ast.ImportFrom, name: str, is_package: bool) -> str | None:
+    """The module that `from ... import` names, below `idesplat`; None for a module of somebody else."""
+    if node.level == 0:
+        module = node.module or ""
+        return module.removeprefix("idesplat").lstrip(".") if module.partition(".")[0] == "idesplat" else None
+    parts = name.split(".")
+    parts = parts[: len(parts) - node.level + is_package]
+    return ".".join([*parts, *([node.module] if node.module else [])])
+
+
+@pytest.fixture(scope="module")
+def graph() -> dict[str, set[str]]:
+    """What each of our modules imports, itself left out."""
+    known = modules()
+    return {name: set(imports(name, path, known)) - {name} for name, path in known.items()}
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_packages_keep_their_boundaries(graph: dict[str, set[str]], package: str) -> None:
+    for name, imported in graph.items():
+        if name.partition(".")[0] == package:
+            tops = {module.partition(".")[0] for module in imported}
+            assert not tops & FORBIDDEN[package], name
+
+
+def test_no_circles_of_imports(graph: dict[str, set[str]]) -> None:
+    ours = {name: {module for module in imported if module in graph} for name, imported in graph.items()}
+    try:
+        TopologicalSorter(ours).prepare()
+    except CycleError as error:
+        pytest.fail(" <- ".join(error.args[1]))
+
+
+@pytest.mark.parametrize("package", ORDERS)
+def test_packages_import_only_what_stands_before_them(graph: dict[str, set[str]], package: str) -> None:
+    rank = {name: index for index, name in enumerate(ORDERS[package])}
+    for name, imported in graph.items():
+        if not name.startswith(f"{package}."):
+            continue
+        own = name.split(".")[1]
+        assert own in rank, f"{name}: not in the order of {package}"
+        for module in imported:
+            if module.startswith(f"{package}."):
+                assert rank[module.split(".")[1]] <= rank[own], f"{name} imports {module}"
+
+
+def test_every_package_is_in_the_wheel() -> None:
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    folders = {path.parent for package in PACKAGES for path in (ROOT / package).rglob("__init__.py")}
+    expected = {"idesplat", *(".".join(["idesplat", *folder.relative_to(ROOT).parts]) for folder in folders)}
+    assert set(settings["packages"]) == expected
+    assert settings["package-dir"] == {"idesplat": "."}
+    with_code = {path.parent for package in PACKAGES for path in (ROOT / package).rglob("*.py")}
+    assert with_code == folders  # a folder without __init__.py would be missed
+
+
+def test_nothing_generic_becomes_importable(tmp_path: Path) -> None:
+    code = "import importlib.util as u; assert not any(u.find_spec(n) for n in ('model', 'export', 'runtime', 'tools'))"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=tmp_path, timeout=60)

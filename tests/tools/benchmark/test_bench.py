@@ -1,0 +1,271 @@
+"""The benchmark: what it counts, what it says, how it fails. No test here depends on how long anything takes."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import SMALL, SMALL_PRESET, run_command
+from idesplat.runtime.inference.session import CPU, Tuning, open_session
+from idesplat.tools.benchmark import cli as bench
+from idesplat.tools.benchmark.report import Row, compare, read_rows, write_rows
+from idesplat.tools.benchmark.worker import (
+    Failed,
+    Worker,
+    Workload,
+    eager,
+    example_arrays,
+    flop_of,
+    last_kernels,
+    matrix,
+)
+from onnx import TensorProto, helper, numpy_helper
+
+USUAL = ("--sizes", "64x96", "--repeats", "2", "--threads", "1")
+
+
+@pytest.fixture(scope="module")
+def measured(exported, tmp_path_factory) -> tuple[Path, str]:
+    """What the command writes and prints for the same network in one file and in stages."""
+    path = tmp_path_factory.mktemp("bench") / "bench.json"
+    command = [sys.executable, "-m", "idesplat.tools.benchmark.cli", *map(str, exported), *USUAL, "--json", str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr
+    return path, done.stdout
+
+
+def test_every_model_gets_a_row(measured):
+    path, printed = measured
+    content = json.loads(path.read_text())
+    assert content["machine"]["threads"] == 1
+    rows = read_rows(path)
+    assert [row.model for row in rows] == ["model.onnx", "staged"]
+    for row in rows:
+        assert (row.preset, row.precision, row.provider) == (SMALL_PRESET, "float32", "CPU")
+        assert (row.views, row.height, row.width) == (2, 64, 96)
+        assert len(row.seconds) == len(row.rates) == 2
+        assert row.to_floor > 0
+        assert 50e6 < row.peak_bytes < 4e9
+        assert row.load_seconds > 0
+        assert sum(row.operators.values()) == pytest.approx(1)
+        assert sum(row.stages.values()) == pytest.approx(1)
+        assert {"encoder", "dpbu1", "dpbu2", "dpbu3", "gaussians"} <= set(row.stages)
+        assert "Conv" in row.operators
+    for text in ("model.onnx", "staged", "/ floor", "Conv", "dpbu3", f"wrote {path}"):
+        assert text in printed
+
+
+def test_the_same_network_in_stages_computes_the_same(measured):
+    fused, staged = read_rows(measured[0])
+    assert staged.flop == pytest.approx(fused.flop, rel=1e-3)  # small things that several stages need are done in each
+    assert fused.floor_flop == staged.floor_flop == min(fused.flop, staged.flop)
+    assert fused.depth_error is None
+    assert staged.depth_error < 1e-3
+
+
+def test_flop_are_those_that_pytorch_counts(measured):
+    """PyTorch counts what it executes; the graph adds the resizing of position embeddings, which is a product there."""
+    import torch
+    from idesplat.model.idesplat.network import IDESplat
+    from torch.utils.flop_counter import FlopCounterMode
+
+    arrays = example_arrays(Workload(2, 64, 96), SMALL.near, SMALL.far)
+    with FlopCounterMode(display=False) as counter, torch.no_grad():
+        IDESplat(SMALL).eval()(*map(torch.from_numpy, arrays))
+    assert read_rows(measured[0])[0].flop == pytest.approx(counter.get_total_flops(), rel=0.02)
+
+
+def test_flop_of_operators_worked_by_hand(tmp_path):
+    rng = np.random.default_rng(0)
+
+    def weight(name: str, *shape: int):
+        return numpy_helper.from_array(rng.normal(size=shape).astype(np.float32), name)
+
+    nodes = [
+        helper.make_node("Conv", ["x", "w"], ["a"], pads=[1, 1, 1, 1], strides=[2, 2], group=2),
+        helper.make_node("ConvTranspose", ["a", "v"], ["b"], strides=[2, 2]),
+        helper.make_node("MatMul", ["b", "m"], ["c"]),
+        helper.make_node("Flatten", ["c"], ["d"], axis=2),
+        helper.make_node("Gemm", ["d", "g"], ["e"], transA=1, transB=1),
+        helper.make_node("DynamicQuantizeLinear", ["e"], ["f", "step", "zero"]),
+        helper.make_node("MatMulInteger", ["f", "i", "zero"], ["y"]),
+    ]
+    weights = [weight("w", 6, 2, 3, 3), weight("v", 6, 5, 2, 2), weight("m", 12, 7), weight("g", 9, 5)]
+    weights.append(numpy_helper.from_array(np.ones((9, 4), np.int8), "i"))
+    given = helper.make_tensor_value_info("x", TensorProto.FLOAT, [1, 4, 10, 12])
+    result = helper.make_tensor_value_info("y", TensorProto.INT32, None)
+    graph = helper.make_graph(nodes, "graph", [given], [result], weights)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=10)
+    session = open_session(model.SerializeToString(), CPU, Tuning(1, tmp_path / "profile", optimise=False))
+    (y,) = session.run(None, {"x": rng.normal(size=(1, 4, 10, 12)).astype(np.float32)})
+    kernels = last_kernels(Path(session.end_profiling()))
+    counted = {kernel["args"]["op_name"]: flop_of(kernel["args"]) for kernel in kernels}
+    assert y.shape == (70, 4)
+    assert counted == {
+        "Conv": 2 * (6 * 5 * 6) * (2 * 3 * 3),
+        "ConvTranspose": 2 * (6 * 5 * 6) * (5 * 2 * 2),
+        "MatMul": 2 * (5 * 10 * 7) * 12,
+        "Flatten": 0,
+        "Gemm": 2 * (70 * 9) * 5,
+        "DynamicQuantizeLinear": 0,
+        "MatMulInteger": 2 * (70 * 4) * 9,
+    }
+
+
+def test_networks_run_in_pytorch():
+    about, run = eager("idesplat-tiny", 1, Workload(2, 64, 64))
+    assert about["load_seconds"] > 0
+    assert run() is None
+
+
+def test_the_machine_is_measured():
+    _, run = matrix()
+    assert run() > 1e8
+
+
+# ---- processes
+
+
+def holding(megabytes: int) -> tuple:
+    return None, lambda: len(np.ones(megabytes << 17))
+
+
+def failing() -> tuple:
+    raise ValueError("no such\nthing")
+
+
+def dying() -> tuple:
+    return None, lambda: os._exit(9)
+
+
+def test_each_process_has_memory_of_its_own():
+    with Worker(holding, 1) as small, Worker(holding, 300) as large:
+        assert (small.run().result, large.run().result) == (1 << 17, 300 << 17)
+        more = large.finish() - small.finish()
+    assert 250e6 < more < 350e6
+
+
+def test_a_process_that_fails_says_why():
+    with pytest.raises(Failed, match=r"^no such thing$"):
+        Worker(failing)
+    with Worker(dying) as worker, pytest.raises(Failed, match=r"ended with 9; memory may have run out"):
+        worker.run()
+
+
+# ---- comparing
+
+
+def a_row(**changes) -> Row:
+    row = Row(
+        "m.onnx", "p", "float32", "CPU", 2, 64, 96, seconds=[1.0, 1.1, 1.2, 1.3], rates=[1e9] * 4, peak_bytes=1000
+    )
+    return replace(row, **changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, []),
+        ({"seconds": [1.1, 1.2, 1.3, 1.4]}, []),  # more than a twentieth, within the spread
+        ({"seconds": [2.0, 2.2, 2.4, 2.6]}, ["slower"]),
+        ({"seconds": [0.5, 0.5, 0.6, 0.6]}, []),
+        ({"seconds": [2.0, 2.2, 2.4, 2.6], "rates": [5e8] * 4}, []),  # the machine is half as fast today
+        ({"seconds": [1.0, 1.1, 1.2, 1.3], "rates": [2e9] * 4}, ["slower"]),
+        ({"peak_bytes": 1040}, []),
+        ({"peak_bytes": 1100}, ["more memory"]),
+        ({"seconds": [9.0] * 4, "peak_bytes": 9000}, ["slower", "more memory"]),
+        ({"seconds": [9.0] * 4, "views": 3}, []),  # another workload
+    ],
+)
+def test_what_became_worse_by_more_than_noise(changes, expected):
+    row = a_row(**changes)
+    assert compare([row], [a_row()]) == [f"{row.name}: {verdict}" for verdict in expected]
+
+
+def test_a_small_steady_loss_is_within_tolerance():
+    assert compare([a_row(seconds=[1.03] * 4)], [a_row(seconds=[1.0] * 4)]) == []
+    assert len(compare([a_row(seconds=[1.07] * 4)], [a_row(seconds=[1.0] * 4)])) == 1
+
+
+def test_rows_survive_their_file(tmp_path):
+    row = a_row(eager_seconds=[2.0, 2.2, 2.4, 2.6], flop=10**9, floor_flop=5 * 10**8)
+    write_rows(tmp_path / "rows.json", {}, [row])
+    (again,) = read_rows(tmp_path / "rows.json")
+    assert asdict(again) == asdict(row)
+    assert again.to_eager == pytest.approx(0.5)
+    assert again.to_floor == pytest.approx(2 * 1.15)
+
+
+def test_the_command_compares(exported, measured, tmp_path, capsys):
+    """The older run was ten thousand times faster, or slower, than any machine makes up for."""
+    older = tmp_path / "older.json"
+    for factor, status in ((1e-4, 1), (1e4, 0)):
+        rows = [replace(row, seconds=[time * factor for time in row.seconds]) for row in read_rows(measured[0])]
+        write_rows(older, {}, rows)
+        assert run_command(bench.main, exported[0], *USUAL, "--no-eager", "--compare", older) == status
+        printed = capsys.readouterr()
+        assert ("slower" in printed.err) == bool(status)
+        assert "since then" in printed.out
+
+
+# ---- ends
+
+
+def test_what_is_done_when_it_is_interrupted_is_kept(exported, tmp_path, monkeypatch, capsys):
+    def one_and_stop(entries, workload, settings, say):
+        if workload.views == 4:
+            raise KeyboardInterrupt
+        return [a_row(views=workload.views)]
+
+    monkeypatch.setattr(bench, "measure", one_and_stop)
+    path = tmp_path / "part.json"
+    arguments = (exported[0], *USUAL, "--views", "2,3,4,6", "--json", path)
+    assert run_command(bench.main, *arguments) == bench.INTERRUPTED
+    assert [row.views for row in read_rows(path)] == [2, 3]
+    assert "interrupted" in capsys.readouterr().err
+
+
+def test_where_nothing_can_be_measured_it_says_why(exported, capsys):
+    assert run_command(bench.main, exported[0], "--sizes", "64x50", "--repeats", "1", "--no-eager") == 2
+    printed = capsys.readouterr().err
+    assert "multiples of 16" in printed
+    assert "nothing could be measured" in printed
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("--views", "1"), "--views 1"),
+        (("--views", "two"), "--views two"),
+        (("--sizes", "large"), "HEIGHTxWIDTH"),
+        (("nowhere.onnx",), "nowhere.onnx: no such model"),
+        (("--json", "/proc/nowhere/bench.json"), "cannot write into /proc"),
+        (("--compare", "nowhere.json"), "nowhere.json: cannot be read"),
+    ],
+)
+def test_bad_input_gets_one_line(arguments, expected, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert run_command(bench.main, *arguments) == 2
+    printed = capsys.readouterr().err
+    assert expected in printed
+    assert printed.count("\n") == 1
+
+
+@pytest.mark.parametrize("content", ["", "[]", '{"rows": [{}]}', '{"rows": 1}'])
+def test_files_that_are_no_benchmark_are_refused(content, tmp_path, capsys):
+    (tmp_path / "old.json").write_text(content)
+    assert run_command(bench.main, "--compare", tmp_path / "old.json") == 2
+    assert "what --json" in capsys.readouterr().err
+
+
+def test_environment_is_left_as_it_was(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
+    with bench.thread_environment(3):
+        assert (os.environ["OMP_NUM_THREADS"], os.environ["MKL_NUM_THREADS"]) == ("3", "3")
+    assert os.environ["OMP_NUM_THREADS"] == "7"
+    assert "MKL_NUM_THREADS" not in os.environ

@@ -1,0 +1,255 @@
+"""The command idesplat-eval: its numbers against the library used by hand, and one line for what is wrong."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from conftest import run_command
+from idesplat.runtime import Gaussians, Runner, rasterize, read_cameras
+from idesplat.runtime.cli.outputs import Outputs
+from idesplat.runtime.images.io import find_images, load_image
+from idesplat.runtime.images.resizing import fit
+from idesplat.runtime.inference import predictor as runner
+from idesplat.runtime.system.files import replacing
+from idesplat.runtime.views.batch import match
+from idesplat.tools.evaluation import cli as evaluate
+from idesplat.tools.evaluation.cases import procedural_case
+from idesplat.tools.evaluation.chunks import Entry, chunk_cases
+from idesplat.tools.evaluation.cli import main
+from idesplat.tools.evaluation.image_folders import load_case
+from idesplat.tools.synthetic.sampler import HELD_OUT_SEEDS, draw_sample
+from skimage.metrics import structural_similarity
+from test_chunks import as_scene
+
+
+@pytest.fixture(scope="session")
+def opened(exported: tuple[Path, Path]) -> Runner:
+    """The small network; opening it takes longer than running it."""
+    return Runner(exported[0])
+
+
+@pytest.fixture
+def workplace(scene: Path, exported: tuple[Path, Path], opened: Runner, tmp_path: Path, monkeypatch: Any) -> Path:
+    """A folder of one's own with photographs, cameras, depth, model, chunks and index, and we stand in it."""
+    shutil.copytree(scene, tmp_path, dirs_exist_ok=True)
+    shutil.copy(exported[0], tmp_path / "model.onnx")
+    (tmp_path / "chunks").mkdir()
+    torch.save([as_scene(scene, "a"), as_scene(scene, "b")], tmp_path / "chunks" / "000000.torch")
+    index = {"x": None, "b": {"context": [0, 4], "target": [1, 2, 3]}, "gone": {"context": [0, 1], "target": [2]}}
+    (tmp_path / "index.json").write_text(json.dumps(index))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(runner, "Runner", lambda path: opened if path == Path("model.onnx") else Runner(path))
+    return tmp_path
+
+
+Capture = pytest.CaptureFixture[str]
+SCENE = ("scene", "images", "--cameras", "transforms.json", "--model", "model.onnx", "--out", "out")
+CHUNKS = ("chunks", "chunks", "--index", "index.json", "--model", "model.onnx", "--out", "out")
+PROCEDURAL = ("procedural", "--model", "model.onnx", "--out", "out", "--scenes", "1")
+NAMED = ("--context", "000", "--context", "004", "--target", "001", "--target", "002")
+
+
+def results() -> dict[str, Any]:
+    return json.loads(Path("out/results.json").read_text())
+
+
+def drawn_from(gaussians: Gaussians, pose: np.ndarray, K: np.ndarray, near: float) -> np.ndarray:
+    """The Gaussians from a camera at 64x96."""
+    scene = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
+    return rasterize(*scene, np.linalg.inv(pose.astype(np.float64)), K, 96, 64, near=near).rgb
+
+
+def test_scene_measures_what_the_library_gives(workplace: Path, opened: Runner, capsys: Capture) -> None:
+    assert run_command(main, *SCENE, *NAMED, "--near", "1", "--far", "20", "--depth", "depth") == 0
+    cameras = read_cameras("transforms.json")
+    context = [cameras[0], cameras[4]]
+    prediction = opened.predict([Path(camera.name) for camera in context], context, near=1, far=20)
+    pixels, intrinsics = fit(load_image(Path(cameras[2].name)), cameras[2].K, 64, 96)
+    photograph = pixels.transpose(1, 2, 0)
+    K = np.diag([96, 64, 1]) @ intrinsics
+    drawn = drawn_from(prediction.gaussians, cameras[2].extrinsics, K, near=0.01)
+    content = results()
+    assert content["command"] == "scene" and content["model"]["preset"] == "idesplat-small"
+    (only,) = content["scenes"]
+    assert only["context"] == ["000.png", "004.png"]
+    assert [target["name"] for target in only["targets"]] == ["001.png", "002.png"]
+    scores = only["targets"][1]["scores"]
+    psnr = -10 * np.log10(np.mean((drawn.clip(0, 1) - photograph) ** 2))
+    ssim = structural_similarity(drawn, photograph, win_size=11, gaussian_weights=True, data_range=1.0, channel_axis=2)
+    assert scores["model"]["psnr"] == pytest.approx(psnr, abs=1e-3)
+    assert scores["model"]["ssim"] == pytest.approx(ssim, abs=1e-4)
+    assert scores["plane"]["psnr"] > scores["nearest"]["psnr"] > 5
+    assert (only["near"], only["far"]) == (1, 20)
+    assert 1 <= only["targets"][1]["details"]["plane_depth"] <= 20
+    mean = np.mean([target["scores"]["model"]["psnr"] for target in only["targets"]])
+    assert content["mean"]["model"]["psnr"] == pytest.approx(mean)
+
+    frames = match(find_images(["images"]), read_cameras("transforms.json"))
+    truth = load_case(frames, [0, 4], [1], (64, 96), opened.depth_range, Path("depth")).depth
+    error = np.abs(prediction.depth - truth) / truth
+    assert only["depth"]["abs_rel"] == pytest.approx(error.mean(), rel=1e-4)
+    assert only["depth"]["within_5_percent"] == pytest.approx((error < 0.05).mean(), abs=1e-3)
+    assert content["mean"]["model"]["abs_rel"] == only["depth"]["abs_rel"]
+
+    strip = cv2.imread("out/000+004-002.png")
+    assert strip.shape == (64, 5 * 96 + 4 * 4, 3)
+    np.testing.assert_allclose(strip[:, :96, ::-1] / 255, photograph, atol=0.6 / 255)
+    np.testing.assert_allclose(strip[:, 100:196, ::-1] / 255, drawn.clip(0, 1), atol=0.6 / 255)
+    printed = capsys.readouterr().out
+    for text in ("001.png", "PSNR, dB", "AbsRel", "over plane", "wrote out/results.json", "2 views held out, 64x96"):
+        assert text in printed
+
+
+def test_scene_without_names_says_what_was_chosen(workplace: Path, capsys: Capture) -> None:
+    assert run_command(main, *SCENE, "--views", "3") == 0
+    assert "held out 000.png, inferred from 001.png, 002.png, 003.png" in capsys.readouterr().out
+    (only,) = results()["scenes"]
+    assert only["context"] == ["001.png", "002.png", "003.png"] and only["depth"] == {}
+
+
+def test_chunks_give_the_papers_means(workplace: Path, opened: Runner, capsys: Capture) -> None:
+    assert run_command(main, *CHUNKS) == 0
+    content = results()
+    (only,) = content["scenes"]
+    assert only["name"] == "b" and only["context"] == ["0", "4"]
+    assert [target["name"] for target in only["targets"]] == ["1", "2", "3"]
+    assert content["missing"] == 1 and content["skipped"] == {}
+    assert list(content["mean"]) == ["model"]
+    values = [target["scores"]["model"]["psnr"] for target in only["targets"]]
+    assert content["mean"]["model"]["psnr"] == pytest.approx(np.mean(values))
+    (case,) = chunk_cases([Path("chunks/000000.torch")], {"b": Entry([0, 4], [2])}, (64, 96), (0.5, 100.0), print)
+    given = case.context
+    prediction = opened.predict_arrays(given.images, given.extrinsics, given.intrinsics, 0.5, 100.0)
+    truth = case.targets.picture(0)
+    # the releases draw nothing before a fifth of the near plane
+    drawn = drawn_from(prediction.gaussians, case.targets.extrinsics[0], case.targets.K(0), near=0.2 * 0.5)
+    assert values[1] == pytest.approx(-10 * np.log10(np.mean((drawn.clip(0, 1) - truth) ** 2)), abs=1e-3)
+    printed = capsys.readouterr().out
+    assert "1 of the index's 2 scenes" in printed and "1 of the index's scenes are not in chunks" in printed
+    assert cv2.imread("out/b-2.png").shape == (64, 4 * 96 + 3 * 4, 3)
+
+
+def test_chunks_go_on_after_a_damaged_scene(workplace: Path, scene: Path, capsys: Capture) -> None:
+    blind, still = as_scene(scene, "blind"), as_scene(scene, "still")
+    blind["images"][1] = blind["images"][1][:200]
+    still["cameras"][:, 6:] = still["cameras"][0, 6:].clone()
+    torch.save([blind, still, as_scene(scene, "b")], "chunks/000000.torch")
+    entries = {key: {"context": [0, 1], "target": [2]} for key in ("blind", "still", "b")}
+    Path("index.json").write_text(json.dumps(entries))
+    assert run_command(main, *CHUNKS) == 0
+    content = results()
+    assert [entry["name"] for entry in content["scenes"]] == ["b"]
+    assert set(content["skipped"]) == {"blind", "still"} and content["missing"] == 0
+    printed = capsys.readouterr().out
+    assert "skipped blind: frame 1: the picture cannot be decoded" in printed and "skipped still: " in printed
+
+
+def test_procedural_scenes_have_true_depth(workplace: Path, opened: Runner, capsys: Capture) -> None:
+    assert len(HELD_OUT_SEEDS) == evaluate.HELD_OUT_SCENES
+    assert run_command(main, *PROCEDURAL, "--views", "3") == 0
+    content = results()
+    (only,) = content["scenes"]
+    assert only["name"] == str(HELD_OUT_SEEDS[0]) and len(only["context"]) == 3
+    sample = draw_sample(HELD_OUT_SEEDS[0], 3, evaluate.TARGETS, 64, 96)
+    prediction = opened.predict_arrays(
+        sample.images[:3], sample.extrinsics[:3], sample.intrinsics[:3], sample.near, sample.far
+    )
+    error = np.abs(prediction.depth - sample.depth[:3]) / sample.depth[:3]
+    assert content["mean"]["model"]["abs_rel"] == pytest.approx(error.mean(), rel=1e-5)
+    assert content["mean"]["model"]["within_5_percent"] == pytest.approx((error < 0.05).mean())
+    assert set(content["mean"]) == {"model", "nearest", "plane", "true depth"}
+    assert content["mean"]["true depth"]["psnr_seen"] > content["mean"]["nearest"]["psnr_seen"]
+    assert "1 held-out procedural scenes, 3 of 3 views, 64x96" in capsys.readouterr().out
+
+
+def test_fewer_views_of_the_same_scene() -> None:
+    """The targets stay, and of four views the first and the last are left."""
+    seed, shape = HELD_OUT_SEEDS[0], (32, 48)
+    all_four, two = (procedural_case(seed, count, 4, 1, *shape) for count in (4, 2))
+    np.testing.assert_array_equal(two.targets.images, all_four.targets.images)
+    np.testing.assert_array_equal(two.context.extrinsics, all_four.context.extrinsics[[0, 3]])
+    np.testing.assert_array_equal(two.depth, all_four.depth[[0, 3]])
+
+
+def test_lpips_takes_its_place_beside_the_others(workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from idesplat.tools.evaluation import metrics
+
+    monkeypatch.setattr(metrics, "load_lpips", lambda: lambda picture, truth, valid: 0.25)
+    assert run_command(main, *SCENE, *NAMED) == 0
+    assert {method: scores["lpips"] for method, scores in results()["mean"].items()} == {
+        "model": 0.25,
+        "nearest": 0.25,
+        "plane": 0.25,
+    }
+
+
+def nothing() -> None:
+    pass
+
+
+def index(content: dict[str, Any]) -> Callable[[], int]:
+    return lambda: Path("index.json").write_text(json.dumps(content))
+
+
+def cameras_at_one_place() -> None:
+    content = json.loads(Path("transforms.json").read_text())
+    for frame in content["frames"]:
+        for row in frame["transform_matrix"][:3]:
+            row[3] = 1.0
+    Path("transforms.json").write_text(json.dumps(content))
+
+
+BAD = {
+    "an unknown frame": (nothing, (*SCENE, *NAMED, "--target", "0099"), "--target 0099"),
+    "a frame that is context and target": (nothing, (*SCENE, *NAMED, "--target", "000"), "000.png is named twice"),
+    "one frame of context": (nothing, (*SCENE, "--context", "000", "--target", "001"), "expected at least 2"),
+    "more views than photographs": (nothing, (*SCENE, "--views", "5"), "too few are left"),
+    "no photographs": (nothing, ("scene", "nowhere", *SCENE[2:]), "nowhere"),
+    "no cameras": (nothing, (*SCENE, "--cameras", "none.json"), "none.json"),
+    "cameras at one place": (cameras_at_one_place, (*SCENE, *NAMED), "same place"),
+    "no model": (nothing, (*SCENE, "--model", "none.onnx"), "none.onnx"),
+    "a size it cannot take": (nothing, (*SCENE, "--size", "64x50"), "multiples of 16"),
+    "near behind far": (nothing, (*SCENE, "--near", "5", "--far", "2"), "expected 0 < near < far"),
+    "near of zero": (nothing, (*SCENE, "--near", "0"), "expected 0 < near < far"),
+    "near of nothing": (nothing, (*CHUNKS, "--near", "nan"), "expected 0 < near < far"),
+    "near behind the model's far": (nothing, (*CHUNKS, "--near", "200"), "near 200 and far 100"),
+    "no depth": (nothing, (*SCENE, "--depth", "images"), "no readable depth"),
+    "an output folder that nobody may write to": (nothing, (*SCENE, "--out", "/proc"), "cannot write into /proc"),
+    "an output folder that is a file": (nothing, (*SCENE, "--out", "transforms.json"), "transforms.json"),
+    "no chunks": (nothing, ("chunks", "images", *CHUNKS[2:]), "no .torch chunks"),
+    "no index": (nothing, (*CHUNKS, "--index", "none.json"), "none.json"),
+    "an empty index": (index({"a": None}), CHUNKS, "names no scene"),
+    "an index of other chunks": (index({"z": {"context": [0, 1], "target": [2]}}), CHUNKS, "1 are not in chunks"),
+    "an index of longer scenes": (index({"a": {"context": [0, 9], "target": [2]}}), CHUNKS, "has 5 frames"),
+    "a damaged chunk": (lambda: Path("chunks/000000.torch").write_bytes(b"x"), CHUNKS, "000000.torch"),
+    "one frame of context in the index": (index({"a": {"context": [0], "target": [2]}}), CHUNKS, "1 cannot be used"),
+    "fewer views drawn than given": (nothing, (*PROCEDURAL, "--drawn", "1"), "expected at least the 2"),
+    "procedural scenes of a size it cannot take": (nothing, (*PROCEDURAL, "--size", "20x20"), "multiples of 16"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_input_is_one_line_and_leaves_nothing(name: str, workplace: Path, capfd: Capture) -> None:
+    spoil, arguments, expected = BAD[name]
+    spoil()
+    Path("out").mkdir()
+    with Outputs("idesplat-eval"), replacing(Path("out/results.json")) as temporary:
+        temporary.write_bytes(b"the result of yesterday")
+    before = {path: path.stat().st_mtime_ns for path in workplace.rglob("*")}
+    assert run_command(main, *arguments) == 2
+    lines = [line for line in capfd.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert len(lines) == 1
+    assert expected in lines[0]
+    assert {path: path.stat().st_mtime_ns for path in workplace.rglob("*")} == before
+
+
+def test_procedural_scenes_need_numba(workplace: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    monkeypatch.setattr(evaluate, "find_spec", lambda package: None)
+    assert run_command(main, *PROCEDURAL) == 2
+    assert "numba is needed" in capsys.readouterr().err

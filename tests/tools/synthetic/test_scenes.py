@@ -1,0 +1,228 @@
+"""Procedural scenes: exact depth, cameras that agree with the pictures, seeds that keep apart."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from idesplat.tools.synthetic.layout import furnished_room
+from idesplat.tools.synthetic.raycast import BOX, CYLINDER, ELLIPSOID, Scene
+from idesplat.tools.synthetic.sampler import (
+    HELD_OUT_SEEDS,
+    TRAINING_SEEDS,
+    VALIDATION_SEEDS,
+    Sample,
+    draw_sample,
+    look_at,
+    photograph,
+    scene_textures,
+)
+from idesplat.tools.synthetic.textures import LEVELS, SIZE, Textures, texture_bank
+
+GREY = Textures(np.full((1, sum((SIZE >> level) ** 2 for level in range(LEVELS)), 3), 128, np.uint8), ("plain",))
+ROOM = (BOX, (0.0, 0.0, 0.0), (10.0, 10.0, 10.0), np.eye(3))
+
+
+def scene_of(*solids: tuple[int, tuple[float, ...], tuple[float, ...], np.ndarray]) -> Scene:
+    """Solids (shape, centre, halves, axes) of one grey material under one lamp that casts shadows."""
+    shapes, centres, halves, axes = zip(ROOM, *solids, strict=True)
+    return Scene(
+        shapes=np.array(shapes),
+        centres=np.array(centres),
+        axes=np.array(axes),
+        halves=np.array(halves),
+        materials=np.zeros((len(shapes), 6), np.int64),
+        textures=np.zeros(1, np.int64),
+        uv=np.eye(2, 3)[None],
+        colours=np.eye(3, 4)[None],
+        frequencies=np.ones(1),
+        glosses=np.zeros(1),
+        glows=np.zeros(1),
+        light_positions=np.array([[0.0, -9.0, 0.0]]),
+        light_colours=np.full((1, 3), 0.5),
+        light_reaches=np.array([1e9]),
+        light_lengths=np.array([0.0]),
+        ambient=np.full(3, 0.25),
+    )
+
+
+def turned(degrees: float) -> np.ndarray:
+    """Axes turned about y."""
+    cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]])
+
+
+def pixel_rays(intrinsics: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Rays with z = 1 through the pixel centres, camera frame, [height, width, 3]."""
+    x, y = np.meshgrid((np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height)
+    return np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(intrinsics).T
+
+
+WIDE_ANGLE = np.array([[0.7, 0, 0.48], [0, 0.9, 0.53], [0, 0, 1]])
+
+
+def test_depth_of_walls_is_analytic() -> None:
+    pose = look_at(np.array([1.0, -2.0, -3.0]), np.array([4.0, 1.0, 5.0]), roll=0.3)
+    _, depth = photograph(scene_of(), GREY, pose, WIDE_ANGLE, 40, 56, 0)
+    rays = pixel_rays(WIDE_ANGLE, 40, 56) @ pose[:3, :3].T
+    to_walls = np.where(rays > 0, 10 - pose[:3, 3], -10 - pose[:3, 3]) / rays
+    np.testing.assert_allclose(depth, to_walls.min(axis=-1), rtol=1e-6)
+
+
+def test_depth_of_solids_is_analytic() -> None:
+    """The middle pixel looks along z at solids whose front is known; z-depth, not distance, in the other pixels."""
+    straight = np.array([[1.0, 0, 0.5], [0, 1.0, 0.5], [0, 0, 1]])
+    fronts = {
+        (BOX, 0.0): 4 - 0.5,
+        (BOX, 45.0): 4 - 0.5 / np.cos(np.pi / 4),  # the ray meets the long face at a slant
+        (ELLIPSOID, 0.0): 4 - 0.5,
+        (CYLINDER, 90.0): 4 - 1.5,
+    }
+    for (shape, degrees), expected in fronts.items():
+        scene = scene_of((shape, (0.0, 0.0, 4.0), (1.5, 0.8, 0.5), turned(degrees)))
+        _, depth = photograph(scene, GREY, np.eye(4), straight, 33, 33, 0)
+        assert depth[16, 16] == pytest.approx(expected, rel=1e-6), (shape, degrees)
+    # A card that faces the camera has one z-depth all over.
+    card = scene_of((BOX, (0.0, 0.0, 4.0), (1.0, 1.0, 0.01), np.eye(3)))
+    _, depth = photograph(card, GREY, np.eye(4), straight, 64, 64, 0)
+    np.testing.assert_allclose(depth[20:44, 20:44], 3.99, rtol=1e-6)
+    assert (depth == np.float32(3.99)).mean() == pytest.approx((2 / 3.99) ** 2, rel=0.05)
+
+
+def test_lamp_casts_a_shadow_below_a_solid() -> None:
+    above = look_at(np.array([0.0, 0.0, -8.0]), np.array([0.0, 9.0, 0.0]))
+    square = np.array([[1.0, 0, 0.5], [0, 1.0, 0.5], [0, 0, 1]])
+    ball = scene_of((ELLIPSOID, (0.0, -4.0, 0.0), (2.0, 1.0, 2.0), np.eye(3)))
+    with_ball, depth = photograph(ball, GREY, above, square, 48, 48, 4)
+    without, empty_depth = photograph(scene_of(), GREY, above, square, 48, 48, 4)
+    shaded = (with_ball < 0.8 * without).all(axis=-1) & (depth == empty_depth)
+    points = pixel_rays(square, 48, 48) * depth[..., None] @ above[:3, :3].T + above[:3, 3]
+    on_floor = points[..., 1] > 9.999
+    from_middle = np.hypot(points[..., 0], points[..., 2])
+    # The cone from the lamp that just touches the ball: it stands 5 above the centre, half axes 2 and 1 (down).
+    slope = 2 / np.sqrt(5**2 - 1)
+    assert shaded[on_floor & (from_middle < 0.97 * 19 * slope)].all()
+    assert not shaded[on_floor & (from_middle > 1.03 * 19 * slope)].any()
+
+
+def test_same_seed_same_sample_other_seed_another() -> None:
+    first, again, other = (draw_sample(seed, 2, 1, 32, 48) for seed in (7, 7, 8))
+    for name in ("images", "depth", "extrinsics", "intrinsics", "near", "far"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
+    assert np.abs(first.images - other.images).mean() > 0.05
+    assert np.abs(first.intrinsics - other.intrinsics).max() > 0.01
+
+
+def test_target_drawn_closer_is_a_window_of_the_larger_picture() -> None:
+    """Context and cameras stay; every pixel of the window shows what the large picture shows there."""
+    plain, closer = (draw_sample(7, 2, 2, 64, 96, closer=times) for times in ((), (1, 3)))
+    large = draw_sample(7, 2, 2, 3 * 64, 3 * 96)
+    assert np.array_equal(plain.extrinsics[:, :3, :3], closer.extrinsics[:, :3, :3])
+    assert np.array_equal(plain.intrinsics[:3], closer.intrinsics[:3])
+    corner = 3 * plain.intrinsics[3, :2, 2] - closer.intrinsics[3, :2, 2]  # in windows
+    assert (corner >= 0).all() and (corner <= 2).all() and corner.max() > 0
+    left, top = (corner * (96, 64)).round().astype(int)
+    shown = large.depth[3, top : top + 64, left : left + 96] / large.depth[0].min()
+    assert np.median(np.abs(closer.depth[3] / closer.depth[0].min() / shown - 1)) < 0.01
+
+
+def test_samples_are_well_formed() -> None:
+    samples = [draw_sample(seed, 2, 2, 24, 32) for seed in (*range(60), *HELD_OUT_SEEDS[:4])]
+    for sample in samples:
+        assert sample.images.shape == (4, 3, 24, 32) and sample.depth.shape == (4, 24, 32)
+        assert all(part.dtype == np.float32 for part in (sample.images, sample.depth, sample.extrinsics))
+        assert sample.images.min() >= 0 and sample.images.max() <= 1
+        assert 0.1 < sample.images.mean() < 0.8
+        assert sample.near < sample.depth.min() and sample.depth.max() < sample.far
+        rotations = sample.extrinsics[:, :3, :3].astype(np.float64)
+        np.testing.assert_allclose(rotations @ rotations.transpose(0, 2, 1), np.eye(3)[None].repeat(4, 0), atol=1e-6)
+        np.testing.assert_allclose(np.linalg.det(rotations), 1, atol=1e-6)
+        assert sample.near == 1
+    # A tight range is at most four times (1 / 0.5 times 2) as wide as the scene.
+    wide = [sample.far > 4 * sample.depth.max() / sample.depth.min() for sample in samples]
+    assert 0.1 < np.mean(wide) < 0.4
+    baselines = [
+        np.linalg.norm(sample.extrinsics[1, :3, 3] - sample.extrinsics[0, :3, 3]) / np.median(sample.depth[0])
+        for sample in samples
+    ]
+    assert 0.02 < np.quantile(baselines, 0.1) < 0.06 and 0.15 < np.quantile(baselines, 0.9) < 0.4
+    flat = [np.ptp(np.log(sample.depth[0])) < 0.2 for sample in samples]
+    assert np.mean(flat) < 0.2
+
+
+def warped(sample: Sample, source: int, target: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Source's points in target's image: pixel places [points, 2] within it, z-depths and source colours."""
+    height, width = sample.depth.shape[1:]
+    points = pixel_rays(sample.intrinsics[source], height, width) * sample.depth[source][..., None]
+    moved = np.linalg.inv(sample.extrinsics[target].astype(np.float64)) @ sample.extrinsics[source]
+    points = points.reshape(-1, 3) @ moved[:3, :3].T + moved[:3, 3]
+    projected = points @ sample.intrinsics[target].T
+    places = projected[:, :2] / projected[:, 2:] * (width, height) - 0.5
+    inside = ((places > 0) & (places < (width - 1.001, height - 1.001))).all(axis=1) & (points[:, 2] > 0)
+    colours = sample.images[source].reshape(3, -1).T
+    return places[inside], points[inside, 2], colours[inside], inside
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3, 4, 5, 6])
+def test_views_agree_where_depth_says_so(seed: int) -> None:
+    """A pixel moved by its depth meets the other view's depth and colour, or is hidden there, but floats nowhere."""
+    sample = draw_sample(seed, 1, 2, 96, 96)
+    places, z, colours, inside = warped(sample, 1, 2)
+    assert inside.mean() > 0.3
+    column, row = places.astype(int).T
+    corners = [(row + i, column + j) for i in (0, 1) for j in (0, 1)]
+    around = np.stack([sample.depth[2][corner] for corner in corners])
+    fu, fv = places.T - (column, row)
+    weights = np.stack([(1 - fv) * (1 - fu), (1 - fv) * fu, fv * (1 - fu), fv * fu])
+    # Inverse depth is linear across the image of a plane, so that interpolating it is exact there.
+    smooth = np.ptp(np.log(around), axis=0) < 0.05
+    seen = 1 / (weights / around).sum(axis=0)
+    met = smooth & (np.abs(z / seen - 1) < 2e-3)
+    assert (z[smooth] < 0.99 * seen[smooth]).mean() < 0.005  # in front of what the other view sees
+    assert met.sum() > 0.6 * smooth.sum()
+    other = np.stack([sample.images[2][:, corner_row, corner_column] for corner_row, corner_column in corners])
+    difference = np.abs((weights[:, None] * other).sum(axis=0).T - colours)[met]
+    unrelated = np.abs(colours[met] - colours[met][::-1])
+    assert difference.mean() < 0.04
+    assert difference.mean() < 0.4 * unrelated.mean()
+
+
+def test_more_samples_come_closer_to_the_true_colour() -> None:
+    """Antialiasing: one ray in a pixel is worse than four, and four are close to many."""
+    bank = scene_textures(0)
+    rng = np.random.default_rng(0)
+    layout = furnished_room(rng, bank)
+    pose = look_at(layout.eyes.mean(axis=0), layout.focus[1])
+    one, four, many = (photograph(layout.scene, bank, pose, WIDE_ANGLE, 64, 64, count)[0] for count in (1, 4, 64))
+    error_of_one, error_of_four = (np.sqrt(np.mean((image - many) ** 2)) for image in (one, four))
+    assert error_of_four < 0.75 * error_of_one
+    assert error_of_four < 0.03
+
+
+def test_reported_seeds_share_nothing_with_training() -> None:
+    assert len(HELD_OUT_SEEDS) == 200
+    ranges = sorted([TRAINING_SEEDS, VALIDATION_SEEDS, HELD_OUT_SEEDS], key=lambda seeds: seeds.start)
+    assert all(before.stop <= after.start for before, after in pairwise(ranges))
+    banks = [scene_textures(seeds[0]).texels for seeds in (TRAINING_SEEDS, HELD_OUT_SEEDS)]
+    training = {texture.tobytes() for texture in banks[0]}
+    assert not any(texture.tobytes() in training for texture in banks[1])
+    assert scene_textures(VALIDATION_SEEDS[0]) is scene_textures(HELD_OUT_SEEDS[0])
+
+
+def test_textures_tile_and_have_levels() -> None:
+    bank = texture_bank(3, 26)
+    start = 0
+    means = []
+    for level in range(LEVELS):
+        size = SIZE >> level
+        part = bank.texels[:, start : start + size * size].reshape(-1, size, size, 3).astype(float)
+        means.append(part.mean(axis=(1, 2)))
+        start += size * size
+        if level == 0:
+            for kind in ("noise", "speckle", "strokes", "cells", "weave", "gradient"):
+                for texture in part[bank.of_kind(kind)]:
+                    seam = np.abs(texture[:, 0] - texture[:, -1]).mean()
+                    inner = np.abs(np.diff(texture, axis=1)).mean(axis=(0, 2)).max()
+                    assert seam <= 1.5 * inner + 1, kind
+    assert start == bank.texels.shape[1]
+    for coarser in means[1:]:
+        np.testing.assert_allclose(coarser, means[0], atol=1)  # of 255: two roundings

@@ -1,0 +1,138 @@
+"""The Gaussian head trained alone: what is frozen stays, features are computed once, opacity is taken off its limit."""
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from idesplat.model.common.gaussian_adapter import SCALE_SHIFT
+from idesplat.runtime.errors import EXIT_STATUS
+from idesplat.tools.training import cli as train
+from idesplat.tools.training import head as head_training
+from idesplat.tools.training.cli import CHECKPOINT, FEATURES, Run
+from idesplat.tools.training.head import (
+    HEAD_PREFIXES,
+    SCALE_GAIN,
+    START_OPACITY,
+    FeatureCache,
+    HeadSample,
+    head_loss,
+    head_order,
+    reset_opacity,
+    scene_index,
+)
+from idesplat.tools.training.initialization import new_model
+from idesplat.tools.training.scenes import Order, Views, draw_views
+from idesplat.tools.training.schedule import Part
+from test_train import SETTINGS, SMALL, finished, logged, one_thread, refused
+
+__all__ = ["finished", "one_thread"]  # fixtures
+CONFIG = replace(SMALL, cross_view_channels=4, scale_in_pixels=True)
+HEAD = replace(SETTINGS, gradual=False, steps=4, batch=1, part="head", scenes=3)
+
+
+@pytest.fixture
+def cache(tmp_path: Path) -> FeatureCache:
+    return FeatureCache(tmp_path / "cache", new_model(CONFIG, seed=0), draw_views, "test")
+
+
+def test_every_scene_comes_once_an_epoch() -> None:
+    places = [scene_index(7, place, 5) for place in range(15)]
+    assert [sorted(places[epoch : epoch + 5]) for epoch in (0, 5, 10)] == [[0, 1, 2, 3, 4]] * 3
+    assert len({tuple(places[epoch : epoch + 5]) for epoch in (0, 5, 10)}) > 1
+
+
+def test_orders_repeat_and_have_views_as_they_should() -> None:
+    orders = [head_order(3, index, 64, 64, 0.25) for index in range(400)]
+    assert orders == [head_order(3, index, 64, 64, 0.25) for index in range(400)]
+    views = Counter(order.context for order in orders)
+    assert views.keys() == head_training.VIEW_SHARES.keys() and views[2] == pytest.approx(300, abs=30)
+    assert sum(order.real for order in orders) == pytest.approx(100, abs=30)
+
+
+def test_features_are_computed_once_and_give_the_same_gaussians(cache: FeatureCache) -> None:
+    """What comes off the disk predicts what the whole network does, but for bytes and half precision."""
+    order = Order(11, 2, (1,), 64, 64)
+    sample = cache.load(order)
+    views = draw_views(order)
+    with torch.no_grad():
+        whole = cache.model(views.images, views.extrinsics, views.intrinsics, views.near, views.far)
+        cameras = head_training.cameras_of(sample.views)
+        cached = cache.model.gaussians.predict(sample.views.images, cameras, sample.inputs)
+    assert torch.equal(cached.depth, whole.depth)
+    assert (cached.raw - whole.raw).abs().max() < 0.05 * whole.raw.std()
+
+    def fail(_: Order) -> Views:
+        raise AssertionError("drawn again")
+
+    again = FeatureCache(cache.folder.parent, cache.model, fail, "test").load(order)
+    assert torch.equal(again.inputs.context, sample.inputs.context)
+    other = FeatureCache(cache.folder.parent, new_model(CONFIG, seed=1), fail, "test")
+    with pytest.raises(AssertionError, match="drawn again"):  # features of other weights are others
+        other.load(order)
+
+
+def test_saturated_opacity_is_reset_and_any_other_left(cache: FeatureCache) -> None:
+    samples = [cache.load(Order(11, 2, (1,), 64, 64))]
+    model = cache.model
+    bias = model.gaussians.head2.bias
+    assert bias is not None
+    before = bias.detach().clone()
+    reset_opacity(model, samples)
+    assert torch.equal(bias, before)  # a new network's opacity is not saturated
+    with torch.no_grad():
+        bias[0] = 8.0
+    _, scale_before = _opacity_and_scale(model, samples[0])
+    reset_opacity(model, samples)
+    opacity, scale = _opacity_and_scale(model, samples[0])
+    assert opacity == pytest.approx(START_OPACITY, abs=0.02)
+    assert scale == pytest.approx(SCALE_GAIN * scale_before, rel=0.02)
+
+
+def _opacity_and_scale(model: torch.nn.Module, sample: HeadSample) -> tuple[float, float]:
+    """Mean opacity and median scale in pixels."""
+    with torch.no_grad():
+        raw = model.gaussians.predict(sample.views.images, head_training.cameras_of(sample.views), sample.inputs).raw
+    scales = torch.nn.functional.softplus(raw[:, 3:6] - SCALE_SHIFT)
+    return float(raw[:, 0].sigmoid().mean()), float(scales.median())
+
+
+def test_only_the_head_gets_gradients(cache: FeatureCache) -> None:
+    loss, entry = head_loss(cache.model, cache.load(Order(11, 2, (1, 2), 64, 64)), 0, None)
+    loss.backward()
+    got = {name for name, p in cache.model.named_parameters() if p.grad is not None and p.grad.abs().sum() > 0}
+    assert got and all(name.startswith(HEAD_PREFIXES) for name in got)
+    assert any(name.startswith("gaussians.cross_view.") for name in got)
+    assert entry["psnr"] > 0 and entry["input_psnr"] > 0 and 0 < entry["opacity"] < 1
+
+
+def test_run_trains_the_head_alone_and_resumes(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = replace(HEAD, init=str(finished / CHECKPOINT))
+    whole = tmp_path / "whole"
+    whole.mkdir()
+    Run(whole, settings, SMALL).go(save_every=1e9, validate_every=4)
+    before = torch.load(finished / CHECKPOINT, weights_only=True)["state_dict"]
+    after = torch.load(whole / CHECKPOINT, weights_only=True)["state_dict"]
+    changed = {name for name, value in after.items() if not torch.equal(value, before[name])}
+    assert changed and all(name.startswith(HEAD_PREFIXES) for name in changed)
+    assert len(list((whole / FEATURES).rglob("*.pt"))) == 3
+
+    def stop(bar: train.Bar, entry: dict[str, float]) -> None:
+        if entry["step"] == 2:
+            raise KeyboardInterrupt
+
+    parts = tmp_path / "parts"
+    parts.mkdir()
+    with monkeypatch.context() as stopped:
+        stopped.setattr(train.Bar, "show", stop)
+        with pytest.raises(KeyboardInterrupt):
+            Run(parts, settings, SMALL, features=whole / FEATURES).go(save_every=0, validate_every=4)
+    Run(parts, settings, SMALL, features=whole / FEATURES).go(save_every=1e9, validate_every=4)
+    assert logged(parts) == logged(whole)
+    assert not (parts / FEATURES).exists()
+
+
+def test_a_head_needs_a_network(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert EXIT_STATUS == 2
+    assert "give a checkpoint with --init" in refused(capsys, out=tmp_path / "run", part=Part.HEAD)

@@ -1,0 +1,98 @@
+"""Data-parallel training: two processes make the steps that one makes, and neither outlives the other."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from idesplat.runtime.errors import InputError
+from idesplat.tools.training.cli import CHECKPOINT, LOG, Run, _work
+from idesplat.tools.training.parallel import Team, mean_entries, other_processes
+from test_train import SETTINGS, SMALL
+
+TWO_STEPS = replace(SETTINGS, gradual=False, steps=2, batch=2)
+
+
+def trained(folder: Path, processes: int) -> tuple[dict[str, torch.Tensor], list[dict[str, float]]]:
+    folder.mkdir()
+    run = Run(folder, TWO_STEPS, SMALL, team=Team(0, processes))
+    with other_processes(processes, _work, folder, TWO_STEPS, SMALL, None, 1, 10):
+        run.go(1e9, 10)
+    entries = [json.loads(line) for line in (folder / LOG).read_text().splitlines()]
+    return torch.load(folder / CHECKPOINT, weights_only=True)["training"]["weights"], entries
+
+
+def test_two_processes_make_the_same_steps(tmp_path: Path) -> None:
+    """The same scenes, shared out: the same gradients but for the order of a sum, and the same figures."""
+    alone, entries = trained(tmp_path / "alone", 1)
+    shared, entries_shared = trained(tmp_path / "shared", 2)
+    for entry, other in zip(entries, entries_shared, strict=True):
+        assert other["loss"] == pytest.approx(entry["loss"], rel=1e-3)
+        assert other["gradient"] == pytest.approx(entry["gradient"], rel=1e-2)
+    moved = sum(float((alone[name] - other).abs().sum()) for name, other in shared.items())
+    total = sum(float(value.abs().sum()) for value in alone.values())
+    assert moved < 1e-3 * total
+    # The second step starts from weights that the first one changed, so it tells whether all processes stepped alike.
+    assert len(entries_shared) == 2
+
+
+def test_a_share_of_a_batch_leaves_no_scene_out() -> None:
+    shares = [list(Team(rank, 3).share(8)) for rank in range(3)]
+    assert shares == [[0, 3, 6], [1, 4, 7], [2, 5]]
+    assert list(Team().share(3)) == [0, 1, 2] and Team().leads and not Team(1, 2).leads
+
+
+def test_figures_are_averaged_over_the_scenes_that_have_them() -> None:
+    assert mean_entries([{"loss": 1.0, "psnr": 20.0}, {"loss": 3.0}]) == {"loss": 2.0, "psnr": 20.0}
+
+
+def test_more_processes_than_scenes_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from idesplat.tools.training.cli import train
+
+    with pytest.raises(SystemExit):
+        train(out=tmp_path / "run", batch=1, processes=2)
+    assert "more than the 1 scenes of a step" in capsys.readouterr().err
+
+
+def test_a_killed_run_leaves_no_process_behind(tmp_path: Path) -> None:
+    """SIGKILL for rank 0: the other notices at its next exchange."""
+    options = ["--steps=500", "--size=64", "--batch=2", "--processes=2", "--objective=depth"]
+    command = [sys.executable, "-m", "idesplat.tools.training.cli", f"--out={tmp_path}", *options]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
+    try:
+        deadline = time.monotonic() + 300
+        while not (tmp_path / LOG).exists() or not (tmp_path / LOG).read_text():
+            assert process.poll() is None and time.monotonic() < deadline
+            time.sleep(0.1)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        while _members(process.pid):
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+    finally:
+        if _members(process.pid):
+            os.killpg(process.pid, signal.SIGKILL)
+
+
+def _members(group: int) -> bool:
+    """Whether a process group has a member left."""
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def test_a_process_that_ends_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("Connection closed by peer\nmore")
+
+    monkeypatch.setattr(torch.distributed, "all_gather_object", fail)
+    with pytest.raises(InputError, match=r"ended \(Connection closed by peer\); repeat the command"):
+        Team(0, 2).gather([])

@@ -1,0 +1,424 @@
+"""Training: losses by hand, a few steps that learn, runs that are stopped and go on, and what users get wrong."""
+
+import json
+import math
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import pytest
+import torch
+from idesplat.model.checkpoint import load_idesplat
+from idesplat.model.config import PRESETS, DPBUConfig, DPTConfig, FocusConfig, IDESplatConfig, UNetConfig, ViTConfig
+from idesplat.model.idesplat.network import IDESplat
+from idesplat.runtime.cameras.camera import Camera
+from idesplat.runtime.errors import EXIT_STATUS, InputError
+from idesplat.runtime.views.batch import Views, prepare
+from idesplat.tools.synthetic.make_scene import make_scene
+from idesplat.tools.training import captures as training_folders
+from idesplat.tools.training import cli as train
+from idesplat.tools.training import losses
+from idesplat.tools.training.captures import FolderScenes
+from idesplat.tools.training.cli import CHECKPOINT, CURVES, LOG, PICTURES, Run, Settings
+from idesplat.tools.training.initialization import new_model
+from idesplat.tools.training.log import TrainingLog
+from idesplat.tools.training.scenes import Order, draw_views, drawn_ahead, training_order
+from idesplat.tools.training.schedule import Objective, Phase, curriculum, phase_at, rate_at
+from idesplat.tools.training.state import TrainingState
+from idesplat.tools.training.step import scene_loss, with_input_view
+
+SMALL = IDESplatConfig(
+    backbone_channels=(8, 8, 16),
+    feature_channels=16,
+    transformer_layers=2,
+    transformer_ffn_ratio=1,
+    vit=ViTConfig(dim=16, depth=4, heads=2, mlp_ratio=2, grid=5, taps=(0, 1, 2, 3)),
+    dpt=DPTConfig(features=8, channels=(8, 8, 8, 8), disparity_channels=8),
+    dpbus=(
+        DPBUConfig(channels=16, candidates=17, scale=1, unet=UNetConfig(channels=16, levels=2)),
+        DPBUConfig(channels=16, candidates=9, scale=2, unet=UNetConfig(channels=8, levels=3)),
+        DPBUConfig(channels=8, candidates=5, scale=4, unet=UNetConfig(channels=8, levels=4)),
+    ),
+    residual_unet=UNetConfig(channels=8, levels=4),
+    focus=FocusConfig(channels=16, window=4, topk=(16, 16, 8, 8)),
+    sh_degree=1,
+)
+EVERYTHING = Phase(1.0, units=3, gaussians=True, shrink=1)
+SETTINGS = Settings("small", "both", True, steps=8, batch=2, size=64, lr=1e-3, vit_lr=5e-4, seed=3, init="", data=[])
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """One torch thread, as in training, and afterwards the arithmetic that other tests expect."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+    torch.set_flush_denormal(False)
+
+
+def test_tiny_preset_is_small_and_complete() -> None:
+    config = PRESETS["idesplat-tiny"]
+    with torch.device("meta"):
+        model, released = IDESplat(config), IDESplat(PRESETS["idesplat-re10k"])
+    assert sum(parameter.numel() for parameter in model.parameters()) <= 4_000_000
+    assert {type(part) for part in released.modules()} <= {type(part) for part in model.modules()}
+    assert 256 % config.size_multiple == 0 and config.size_multiple == 32
+
+
+def test_perfect_depth_costs_nothing_and_more_error_more() -> None:
+    truth = torch.rand(2, 1, 8, 8) + 0.1
+    bins = torch.full((2, 1, 1, 1), 0.05)
+    assert losses.inverse_depth_loss(truth, truth, bins) == 0
+    costs = [float(losses.inverse_depth_loss(truth + error, truth, bins)) for error in (0.001, 0.01, 0.1, 1.0)]
+    assert costs == sorted(costs)
+    # A small constant error has no gradient along x and y.
+    by_hand = 0.001 / 0.05 + losses.RELATIVE_SHARE * (1 + 0.001 / truth).log().mean()
+    assert costs[0] == pytest.approx(float(by_hand), rel=0.02)
+
+
+def test_entropy_by_hand() -> None:
+    """Three candidates 0, 1, 2, of which the truth 1.25 shares itself between the last two."""
+    probability = torch.tensor([0.2, 0.5, 0.3]).reshape(1, 3, 1, 1)
+    candidates = torch.tensor([0.0, 1.0, 2.0]).reshape(1, 3, 1, 1)
+    found = losses.entropy_loss(probability, candidates, torch.full((1, 1, 1, 1), 1.25))
+    assert float(found) == pytest.approx(-0.75 * math.log(0.5) - 0.25 * math.log(0.3))
+    assert losses.entropy_loss(probability, candidates, torch.full((1, 1, 1, 1), 2.5)) == 0  # outside of the candidates
+
+
+def test_gaussians_are_held_to_the_middle_of_their_pixels_alone() -> None:
+    raw = torch.randn(2, 22, 3, 4)
+    raw[:, 1:3] = 0.0
+    assert losses.offset_loss(raw) == 0
+    raw[:, 1] = math.log(3)  # sigmoid 0.75, of x alone
+    assert float(losses.offset_loss(raw)) == pytest.approx(losses.OFFSET_SHARE * 0.25 / 2, rel=1e-5)
+
+
+def test_large_errors_of_an_image_do_not_rule() -> None:
+    """Two images, off by 0.1 and by 1 everywhere: their squared errors count as 3e-3 * log(1 + error / 3e-3)."""
+    truth = torch.zeros(2, 3, 4, 4)
+    rendered = truth + torch.tensor([0.1, 1.0])[:, None, None, None]
+    expected = 0.003 * (math.log(1 + 0.01 / 0.003) + math.log(1 + 1 / 0.003)) / 2
+    assert float(losses.render_loss(rendered, truth, None)) == pytest.approx(expected, rel=1e-5)
+    weighted = losses.render_loss(rendered, truth, lambda a, b: (a - b).mean())
+    assert float(weighted) == pytest.approx(expected + losses.LPIPS_SHARE * 0.55, rel=1e-5)
+
+
+def test_an_input_view_is_rendered_beside_the_novel_ones() -> None:
+    views = draw_views(Order(11, 2, (1, 2), 32, 32))
+    shown = with_input_view(views, 1)
+    assert torch.equal(shown.target_images[:2], views.target_images) and len(shown.target_images) == 3
+    assert torch.equal(shown.target_images[2], views.images[1])
+    assert torch.equal(shown.target_extrinsics[2], views.extrinsics[1])
+    assert torch.equal(shown.target_intrinsics[2], views.intrinsics[1])
+
+
+def test_monocular_loss_knows_no_scale() -> None:
+    truth = torch.rand(2, 8, 8) + 0.1
+    scaled = SimpleNamespace(mono_disparity=0.37 * truth[:, None])
+    turned = SimpleNamespace(mono_disparity=truth.flip(2)[:, None])
+    assert float(losses.monocular_loss(scaled, truth)) == pytest.approx(0, abs=1e-6)
+    assert float(losses.monocular_loss(turned, truth)) > 0.01
+
+
+def test_truth_is_picked_where_corners_lie_on_corners() -> None:
+    truth = torch.arange(64.0).reshape(1, 8, 8)
+    assert losses.truth_at(truth, 2, 2).flatten().tolist() == [0, 7, 56, 63]
+    assert torch.equal(losses.truth_at(truth, 8, 8)[:, 0], truth)
+
+
+def test_new_network_matches_from_the_start() -> None:
+    """The regulariser of a new network says what the correlations say: most where they are largest."""
+    model = new_model(PRESETS["idesplat-tiny"], seed=0)
+    candidates = PRESETS["idesplat-tiny"].dpbus[0].candidates
+    peaks = torch.randint(5, candidates - 5, (2, 1, 16, 16))
+    scores = torch.zeros(2, candidates + 1, 16, 16)
+    for shift in (-1, 0, 1):
+        scores.scatter_(1, 1 + peaks + shift, 2.0 - abs(shift))
+    with torch.no_grad():
+        found = model.dpbu1.first.regulariser(scores, 2).argmax(1, keepdim=True)
+    assert ((found - peaks).abs() <= 2).float().mean() > 0.9
+    again, other = new_model(PRESETS["idesplat-tiny"], seed=0), new_model(PRESETS["idesplat-tiny"], seed=1)
+    ours = model.encoder.backbone.conv1.weight
+    assert torch.equal(ours, again.encoder.backbone.conv1.weight)
+    assert not torch.equal(ours, other.encoder.backbone.conv1.weight)
+
+
+def test_lpips_only_where_it_needs_no_download(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "lpips", None)  # not installed
+    assert losses.load_perceptual() is None
+    assert "lpips is not installed" in capsys.readouterr().err
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    monkeypatch.setitem(sys.modules, "lpips", SimpleNamespace())
+    assert losses.load_perceptual() is None
+    assert "weights are not at" in capsys.readouterr().err
+
+
+def test_curriculum_and_rates() -> None:
+    phases = curriculum(Objective.BOTH, gradual=True)
+    seen = [phase_at(phases, step, 100) for step in range(100)]
+    assert seen[0].units == 1 and seen[-1].units == 3 and seen[-1].gaussians and seen[-1].shrink == 1
+    assert [phase.units for phase in seen] == sorted(phase.units for phase in seen)
+    assert not any(phase.gaussians for phase in curriculum(Objective.DEPTH, gradual=True))
+    assert curriculum(Objective.PHOTOMETRIC, gradual=True) == (EVERYTHING,)
+    rates = [rate_at(phases, step, 1000) for step in range(1000)]
+    peak = rates.index(max(rates))
+    assert rates[peak] == 1 and rates[:peak] == sorted(rates[:peak]) and rates[peak:] == sorted(rates[peak:])[::-1]
+    assert rates[0] > 0 and rates[-1] == pytest.approx(0.01, abs=1e-3)
+    # Half the work is done: 0.57 + 0.14 + 0.30 + 1.43 + 1.95 = 4.39 in all, 1.01 of it before the last but one phase.
+    half = next(step for step, rate in enumerate(rates) if step > peak and rate < 0.505)
+    assert half == pytest.approx(1000 * (0.74 + (0.05 + (4.39 - 0.05) / 2 - 1.01) / 11), abs=1.5)
+
+
+def test_scenes_come_in_order_and_repeat() -> None:
+    orders = [training_order(5, step, 0, True, 32, 32, many=True) for step in range(120)]
+    assert orders == [training_order(5, step, 0, True, 32, 32, many=True) for step in range(120)]
+    assert len({order.seed for order in orders}) == 120 and {order.context for order in orders} == {2, 3}
+    drawn = list(drawn_ahead(iter(orders[:7]), draw_views))
+    for order, views in zip(orders, drawn, strict=False):
+        assert views.images.shape == (order.context, 3, 32, 32)
+        again = next(drawn_ahead(iter([order]), draw_views))
+        assert torch.equal(views.images, again.images) and torch.equal(views.inverse_depth, again.inverse_depth)
+
+
+@pytest.mark.parametrize("objective", list(Objective))
+def test_a_few_steps_on_one_scene_learn(objective: Objective) -> None:
+    """Depth and novel views each get better where they are asked for."""
+    state = TrainingState(SMALL, seed=0, lr=3e-3, vit_lr=3e-3)
+    views = next(drawn_ahead(iter([Order(11, 2, (1,), 64, 64)]), draw_views))
+    phase = curriculum(objective, gradual=False)[0]
+    entries = []
+    for _ in range(14):
+        loss, entry = scene_loss(state.model, views, phase, objective, None)
+        loss.backward()
+        state.update(1.0)
+        entries.append(entry)
+    first, last = entries[0], entries[-1]
+    assert last["loss"] < 0.8 * first["loss"]
+    if objective is not Objective.PHOTOMETRIC:
+        assert last["abs_rel"] < 0.8 * first["abs_rel"]
+    if objective is not Objective.DEPTH:
+        assert last["psnr"] > first["psnr"] + 1
+
+
+def logged(folder: Path) -> list[dict[str, float]]:
+    entries = [json.loads(line) for line in (folder / LOG).read_text().splitlines()]
+    return [{name: value for name, value in entry.items() if name != "seconds"} for entry in entries]
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("finished")
+    torch.set_num_threads(1)
+    Run(folder, SETTINGS, SMALL).go(save_every=1e9, validate_every=4)
+    return folder
+
+
+def test_writes_all_that_it_says(finished: Path) -> None:
+    entries = logged(finished)
+    assert [entry["step"] for entry in entries] == list(range(1, 9))
+    assert all(entry["loss"] > 0 for entry in entries) and "psnr" in entries[-1]
+    assert [entry["step"] for entry in entries if "validation_abs_rel" in entry] == [4, 8]
+    assert cv2.imread(str(finished / CURVES)).std() > 5
+    pictures = cv2.imread(str(finished / PICTURES))
+    assert pictures.shape == (4 * 64, 6 * 64, 3) and pictures.std() > 5
+
+
+def test_resumed_run_equals_uninterrupted(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stopped after step 5 was logged but not saved: it is done again, and nothing differs from then on."""
+
+    def stop(bar: train.Bar, entry: dict[str, float]) -> None:
+        if entry["step"] == 5:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as stopped:
+        stopped.setattr(train.Bar, "show", stop)
+        with pytest.raises(KeyboardInterrupt):
+            Run(tmp_path, SETTINGS, SMALL).go(save_every=0, validate_every=4)
+    assert len(logged(tmp_path)) == 5
+    with (tmp_path / LOG).open("a") as log:
+        log.write('{"step": 6, "lo')  # a line half written
+    Run(tmp_path, SETTINGS, SMALL).go(save_every=1e9, validate_every=4)
+    assert logged(tmp_path) == logged(finished)
+    ours, theirs = (torch.load(folder / CHECKPOINT, weights_only=True) for folder in (tmp_path, finished))
+    for name, value in theirs["state_dict"].items():
+        assert torch.equal(ours["state_dict"][name], value), name
+        assert torch.equal(ours["training"]["weights"][name], theirs["training"]["weights"][name]), name
+
+
+def test_checkpoint_is_one_for_the_exporter(finished: Path) -> None:
+    """The exporter's strict loader reads it, and finds the running mean."""
+    model = load_idesplat(finished / CHECKPOINT, SMALL)
+    content = torch.load(finished / CHECKPOINT, weights_only=True)
+    weights = content["training"]["weights"]
+    found = model.state_dict()
+    assert all(torch.equal(found[name], value) for name, value in content["state_dict"].items())
+    assert found.keys() == weights.keys()
+    assert any(not torch.equal(found[name], value) for name, value in weights.items())
+
+
+def test_stopped_while_writing_keeps_the_checkpoint_before(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / CHECKPOINT
+    path.write_bytes((finished / CHECKPOINT).read_bytes())
+    state = TrainingState(SMALL, seed=9, lr=1e-3, vit_lr=1e-3)
+
+    def half(content: object, file: Path) -> None:
+        Path(file).write_bytes(b"PK half of it")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(torch, "save", half)
+    with pytest.raises(KeyboardInterrupt):
+        state.save(path, asdict(SETTINGS))
+    assert [file.name for file in tmp_path.iterdir()] == [CHECKPOINT]
+    state.resume(path, asdict(SETTINGS))
+    assert state.step == SETTINGS.steps
+
+
+def test_killed_process_leaves_a_checkpoint_to_go_on_from(tmp_path: Path) -> None:
+    """SIGKILL, wherever it hits, in a run that writes its checkpoint at every step."""
+    options = {"steps": 500, "size": 64, "batch": 1, "save-every": 0}
+    arguments = [f"--{name}={value}" for name, value in options.items()]
+    command = [
+        sys.executable,
+        "-m",
+        "idesplat.tools.training.cli",
+        f"--out={tmp_path}",
+        "--objective=depth",
+        *arguments,
+    ]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    try:
+        deadline = time.monotonic() + 120
+        while not (tmp_path / CHECKPOINT).exists() or len(logged(tmp_path)) < 4:
+            assert process.poll() is None, process.stderr.read().decode()
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    model = load_idesplat(tmp_path / CHECKPOINT, PRESETS["idesplat-tiny"])
+    assert all(value.isfinite().all() for value in model.state_dict().values())
+    training = torch.load(tmp_path / CHECKPOINT, weights_only=True)["training"]
+    assert 1 <= training["step"] <= len(logged(tmp_path))
+
+
+def test_log_drops_what_is_done_again(tmp_path: Path) -> None:
+    log = TrainingLog(tmp_path / LOG, 0)
+    for step in (1, 2, 3):
+        log.add({"step": step, "loss": 1.0 / step})
+    assert [entry["step"] for entry in TrainingLog(tmp_path / LOG, 2).entries] == [1, 2]
+    assert len((tmp_path / LOG).read_text().splitlines()) == 2
+
+
+def refused(capsys: pytest.CaptureFixture[str], **options: object) -> str:
+    with pytest.raises(SystemExit) as stopped:
+        train.train(**options)
+    assert stopped.value.code == EXIT_STATUS
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    return lines[0]
+
+
+def test_bad_inputs_are_one_line_each(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "run"
+    assert "idesplat-tiny" in refused(capsys, out=out, preset="idesplat-huge")
+    assert "no such preset" in refused(capsys, out=out, preset="depthsplat-small-re10k")
+    assert "multiple of 64" in refused(capsys, out=out, size=200)
+    assert "use photometric" in refused(capsys, out=out, data=[tmp_path])
+    assert "cannot be read" in refused(capsys, out=out, data=[tmp_path], objective=Objective.PHOTOMETRIC)
+    assert "no such file" in refused(capsys, out=out, init=tmp_path / "absent.ckpt")
+    assert "does not fit the network" in refused(capsys, out=out, init=finished / CHECKPOINT)
+    assert "other settings" in refused(capsys, out=finished, steps=9)
+    (tmp_path / CHECKPOINT).write_bytes(b"not a checkpoint")
+    assert "not a checkpoint of a training run" in refused(capsys, out=tmp_path)
+    torch.save({"state_dict": {}}, tmp_path / CHECKPOINT)
+    assert "not a checkpoint of a training run" in refused(capsys, out=tmp_path)
+    assert "is not a folder" in refused(capsys, out=tmp_path / CHECKPOINT / "below")
+    assert not out.exists() or not list(out.iterdir())
+
+
+def test_photographs_are_trained_on_by_their_views_alone(scene: Path, tmp_path: Path) -> None:
+    settings = replace(SETTINGS, objective="photometric", steps=2, data=[str(scene)])
+    Run(tmp_path, settings, SMALL).go(save_every=1e9, validate_every=2)
+    entries = logged(tmp_path)
+    assert all(entry["psnr"] > 0 and "abs_rel" not in entry for entry in entries)
+    assert entries[-1]["validation_psnr"] > 0
+    assert cv2.imread(str(tmp_path / PICTURES)).shape == (4 * 64, 4 * 64, 3)
+
+
+def test_folders_are_drawn_from_as_ordered(scene: Path) -> None:
+    scenes = FolderScenes([scene], near=1, far=20)
+    order = Order(5, 2, (1,), 64, 96)
+    first, again = scenes.draw(order), scenes.draw(order)
+    assert torch.equal(first.images, again.images) and torch.equal(first.target_images, again.target_images)
+    assert first.images.shape == (2, 3, 64, 96) and first.target_images.shape == (1, 3, 64, 96)
+    places = torch.cat([first.extrinsics, first.target_extrinsics])[:, :3, 3]
+    assert len(places.unique(dim=0)) == 3
+    closer = scenes.draw(replace(order, closer=(2,)))
+    corner = (2 * first.target_intrinsics[0, :2, 2] - closer.target_intrinsics[0, :2, 2]).numpy()  # in windows
+    left, top = (corner * (96, 64)).round().astype(int)
+    shown = first.target_images[0].repeat_interleave(2, 1).repeat_interleave(2, 2)
+    shown = shown[:, top : top + 64, left : left + 96]
+    assert torch.equal(first.images, closer.images) and (left > 0 or top > 0)
+    assert (closer.target_images[0] - shown).abs().mean() < 0.05
+    assert len(scenes.draw(Order(5, 4, (1, 2), 64, 96)).images) == 2  # of the 4 photographs that are not held out
+
+
+def test_validation_renders_photographs_that_training_never_uses(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of five photographs, the first one is held out."""
+    used: dict[str, set[str]] = {"train": set(), "validate": set()}
+    now = "train"
+    opened = training_folders.take
+
+    def noted(pair: tuple[Path, Camera], height: int, width: int) -> tuple:
+        used[now].add(pair[0].name)
+        return opened(pair, height, width)
+
+    def noted_all(pairs: list[tuple[Path, Camera]], *rest: object) -> Views:
+        if now == "train":
+            used[now].update(path.name for path, _ in pairs)
+        return prepare(pairs, *rest)
+
+    monkeypatch.setattr(training_folders, "take", noted)
+    monkeypatch.setattr(training_folders, "prepare", noted_all)
+    settings = replace(SETTINGS, objective="photometric", data=[str(scene)])
+    run = Run(tmp_path, settings, SMALL)
+    for seed in range(40):
+        run.source(Order(seed, 2, (1, 2), 64, 64))
+    now = "validate"
+    for seed in range(5):
+        run.held_out(Order(seed, 2, (1,), 64, 64))
+    assert used == {"train": {"001.png", "002.png", "003.png", "004.png"}, "validate": {"000.png"}}
+
+
+def test_folder_with_too_few_photographs_is_refused(tmp_path: Path) -> None:
+    make_scene(tmp_path, seed=2, views=4, height=32, width=48)
+    with pytest.raises(InputError, match="3 photographs to train on and 1 held out for validation, expected at least"):
+        FolderScenes([tmp_path], near=1, far=20)
+
+
+def test_folder_without_a_photograph_is_refused(scene: Path, tmp_path: Path) -> None:
+    shutil.copy(scene / "transforms.json", tmp_path)
+    with pytest.raises(InputError, match="which is not there"):
+        FolderScenes([tmp_path], near=1, far=20)
+
+
+def test_init_takes_weights_and_starts_from_step_zero(finished: Path) -> None:
+    state = TrainingState(SMALL, seed=1, lr=1e-3, vit_lr=1e-3)
+    state.start_from(finished / CHECKPOINT)
+    expected = load_idesplat(finished / CHECKPOINT, SMALL).state_dict()
+    assert state.step == 0
+    assert all(torch.equal(value, expected[name]) for name, value in state.model.state_dict().items())

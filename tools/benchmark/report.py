@@ -1,0 +1,179 @@
+"""What a benchmark found: its rows, tables of them, the JSON file, and what became worse since an older one."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from ...runtime.cli.outputs import write_json
+from ...runtime.cli.terminal import literal
+from ...runtime.errors import InputError
+from ...runtime.system.files import read_bytes
+
+WIDTH = 150  # columns, where there is no terminal to ask
+SHOWN = 7  # operators of a row
+# Runs of the same thing may differ by this factor, whatever their spread says.
+TOLERANCE = 1.05
+
+
+@dataclass
+class Row:
+    """One model, or one network in PyTorch, on one workload; each list has an entry for every round."""
+
+    model: str
+    preset: str
+    precision: str
+    provider: str
+    views: int
+    height: int
+    width: int
+    checkpoint: str = ""  # SHA-256
+    seconds: list[float] = field(default_factory=list)
+    # In the same rounds: the machine's FLOP a second, and the seconds of the same network in eager PyTorch.
+    rates: list[float] = field(default_factory=list)
+    eager_seconds: list[float] = field(default_factory=list)
+    load_seconds: float | None = None
+    peak_bytes: int | None = None
+    # Median relative difference of its depth from that of the first model of the same checkpoint.
+    depth_error: float | None = None
+    # Of this graph, and the fewest of any graph of the same network and workload.
+    flop: int | None = None
+    floor_flop: int | None = None
+    operators: dict[str, float] = field(default_factory=dict)
+    stages: dict[str, float] = field(default_factory=dict)
+    # Why there is nothing of the above.
+    problem: str | None = None
+
+    @property
+    def name(self) -> str:
+        """What it is, in words."""
+        return f"{self.model} ({self.precision}) on {self.provider}, {self.views} views {self.height}x{self.width}"
+
+    @property
+    def key(self) -> tuple:
+        """What makes rows of two benchmarks the same."""
+        return self.model, self.preset, self.precision, self.provider, self.views, self.height, self.width
+
+    @property
+    def effort(self) -> np.ndarray:
+        """FLOP that the machine could have done in each run: a time that does not depend on how fast it is just now."""
+        return np.multiply(self.seconds, self.rates)
+
+    @property
+    def to_eager(self) -> float | None:
+        """Time over eager PyTorch's, the median over the rounds."""
+        return float(np.median(np.divide(self.seconds, self.eager_seconds))) if self.eager_seconds else None
+
+    @property
+    def to_floor(self) -> float | None:
+        """Time over that of its FLOP in one large product of matrices, the median over the rounds."""
+        return float(np.median(self.effort) / self.floor_flop) if self.floor_flop and self.seconds else None
+
+
+def print_rows(rows: Sequence[Row]) -> None:
+    """The table of times and memory, then where the time went."""
+    table = Table()
+    for name in ("model", "precision", "on", "views", "size"):
+        table.add_column(name, no_wrap=True)
+    for name in ("seconds", "spread", "/ eager", "/ floor", "GFLOP", "peak GB", "opened in", "depth off"):
+        table.add_column(name, justify="right")
+    for row in rows:
+        names = (literal(row.model), row.precision, row.provider, str(row.views), f"{row.height}x{row.width}")
+        table.add_row(*names, *_numbers(row))
+    _print(table)
+    shares = Table()
+    for name in ("model", "views", "size", "operators", "stages"):
+        shares.add_column(name, no_wrap=name == "model")
+    for row in rows:
+        if row.operators:
+            size = f"{row.height}x{row.width}"
+            shares.add_row(literal(row.model), str(row.views), size, _shares(row.operators), _shares(row.stages))
+    if shares.rows:
+        _print(shares)
+
+
+def write_rows(path: Path, machine: dict[str, Any], rows: Sequence[Row]) -> None:
+    """Write everything that was measured as JSON."""
+    write_json(path, json.dumps({"machine": machine, "rows": [asdict(row) for row in rows]}, indent=1))
+
+
+def read_rows(path: Path) -> list[Row]:
+    """The rows of a file that `write_rows` wrote; raises InputError."""
+    try:
+        return [Row(**entry) for entry in json.loads(read_bytes(path, "what --json of idesplat-bench wrote"))["rows"]]
+    except InputError:
+        raise
+    except (ValueError, TypeError, LookupError, RecursionError):
+        raise InputError(f"{path}: not what --json of this version of idesplat-bench writes") from None
+
+
+def compare(rows: Sequence[Row], before: Sequence[Row]) -> list[str]:
+    """Print what changed since an older benchmark; the names of what became worse by more than noise.
+
+    Times are compared in units of the machine's own speed in the same rounds. Slower is what is so in the median by
+    more than a twentieth, and in three quarters of the runs than in three quarters of the older ones.
+    """
+    known = {row.key: row for row in before if row.seconds}
+    table = Table(title="since then", title_justify="left")
+    table.add_column("model")
+    for name in ("time", "memory"):
+        table.add_column(name, justify="right")
+    table.add_column("")
+    worse = []
+    for row in rows:
+        old = known.get(row.key)
+        if old is None or not row.seconds:
+            continue
+        verdicts = _verdicts(row, old)
+        time = float(np.median(row.effort) / np.median(old.effort))
+        memory = f"{row.peak_bytes / old.peak_bytes:.2f}" if row.peak_bytes and old.peak_bytes else ""
+        table.add_row(literal(row.name), f"{time:.2f}", memory, ", ".join(verdicts))
+        worse += [f"{row.name}: {verdict}" for verdict in verdicts]
+    _print(table)
+    return worse
+
+
+def _verdicts(row: Row, old: Row) -> list[str]:
+    """In what a row is worse than it was."""
+    verdicts = []
+    slower = np.median(row.effort) > TOLERANCE * np.median(old.effort)
+    if slower and np.percentile(row.effort, 25) > np.percentile(old.effort, 75):
+        verdicts.append("slower")
+    if row.peak_bytes and old.peak_bytes and row.peak_bytes > TOLERANCE * old.peak_bytes:
+        verdicts.append("more memory")
+    return verdicts
+
+
+def _numbers(row: Row) -> list[str]:
+    """A row's cells from the seconds on."""
+    low, median, high = np.percentile(row.seconds, (25, 50, 75))
+    return [
+        f"{median:.3g}",
+        f"{(high - low) / median:.0%}",
+        _number(row.to_eager, "{:.2f}"),
+        _number(row.to_floor, "{:.2f}"),
+        _number(row.flop and row.flop / 1e9, "{:.0f}"),
+        _number(row.peak_bytes and row.peak_bytes / 1e9, "{:.2f}"),
+        _number(row.load_seconds, "{:.2f} s"),
+        _number(row.depth_error, "{:.0e}"),
+    ]
+
+
+def _number(value: float | None, form: str) -> str:
+    return "" if value is None else form.format(value)
+
+
+def _shares(shares: dict[str, float]) -> str:
+    return ", ".join(f"{name} {share:.0%}" for name, share in list(shares.items())[:SHOWN])
+
+
+def _print(table: Table) -> None:
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=WIDTH)
+    console.print(table)

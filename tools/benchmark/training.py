@@ -1,0 +1,156 @@
+"""idesplat-bench --training: scenes a second of training configurations side by side, and where a step's time goes."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ...runtime.system.files import scratch_folder
+
+if TYPE_CHECKING:
+    from ..training.cli import Run
+    from ..training.parallel import Team
+
+# The run that the phases are taken of; only the place of a phase in it matters.
+STEPS = 1000
+# Steps that are not measured: code is compiled and textures are generated in them.
+WARM_UP = 1
+SIZE = 256
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A configuration of training."""
+
+    preset: str
+    precision: str
+    processes: int
+    batch: int
+
+    @property
+    def name(self) -> str:
+        """As the table shows it."""
+        return f"{self.preset}, {self.precision}, {self.processes} process(es), {self.batch} scene(s)"
+
+
+# As training was, and as it is.
+CANDIDATES = (Candidate("idesplat-tiny", "float32", 1, 1), Candidate("idesplat-lite", "bf16", 2, 4))
+# Step of the run at which a phase begins, by what it trains.
+PHASES = {"128x128, first DPBU": 0, "256x256, everything": 900}
+
+
+def bench_training(rounds: int, steps: int) -> None:
+    """Measure every candidate in every phase, interleaved, each in new processes; print a table."""
+    from rich.console import Console
+    from rich.table import Table
+
+    found: dict[tuple[str, Candidate], list[dict[str, Any]]] = defaultdict(list)
+    with Console(stderr=True).status("training") as status:
+        for turn in range(rounds):
+            for phase in PHASES:
+                for candidate in CANDIDATES:
+                    status.update(f"round {turn + 1} of {rounds}: {phase}, {candidate.name}")
+                    found[phase, candidate].append(_measure(phase, candidate, steps))
+    table = Table("phase", "training", "scenes/s", "CPU s/scene", "where the time goes", title="best of the rounds")
+    for (phase, candidate), measured in found.items():
+        best = min(measured, key=lambda one: one["seconds"])
+        parts = ", ".join(f"{name} {share:.0%}" for name, share in best["parts"].items() if share >= 0.01)
+        rate, cpu = best["scenes"] / best["seconds"], min(one["cpu"] / one["scenes"] for one in measured)
+        table.add_row(phase, candidate.name, f"{rate:.2f}", f"{cpu:.2f}", parts)
+    Console().print(table)
+
+
+def _measure(phase: str, candidate: Candidate, steps: int) -> dict[str, Any]:
+    """One candidate in a process of its own, which has others of its own."""
+    command = [sys.executable, "-P", "-m", __name__, phase, json.dumps(list(vars(candidate).values())), str(steps)]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, check=True, capture_output=True, text=True, env=environment)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def _worker(phase: str, candidate: Candidate, steps: int) -> None:
+    """What the process of a measurement does; it prints seconds, CPU seconds of all processes, scenes and shares."""
+    from ..training.parallel import Team, other_processes
+
+    with scratch_folder() as folder:
+        run = _run_at(folder, phase, candidate, Team(0, candidate.processes))
+        with other_processes(candidate.processes, _other, folder, phase, candidate, steps):
+            print(json.dumps(_timed_steps(run, steps)))
+
+
+def _other(team: "Team", folder: Path, phase: str, candidate: Candidate, steps: int) -> None:
+    _timed_steps(_run_at(folder, phase, candidate, team), steps)
+
+
+def _run_at(folder: Path, phase: str, candidate: Candidate, team: "Team") -> "Run":
+    """A new run that stands at the beginning of a phase."""
+    from ..training.cli import Run, Settings, _config
+
+    settings = Settings(
+        *(candidate.preset, "both", True, STEPS, candidate.batch, SIZE, 1e-3, 5e-4, 0, "", []),
+        precision=candidate.precision,
+    )
+    run = Run(folder, settings, _config(settings), team=team)
+    run.state.step = PHASES[phase]
+    return run
+
+
+def _timed_steps(run: "Run", steps: int) -> dict[str, Any]:
+    """Make some steps after the warm-up; CPU seconds are summed over the team."""
+    from ..training.scenes import drawn_ahead
+
+    scenes = drawn_ahead(run.orders(), run.task.load)
+    for _ in range(WARM_UP):
+        run.one_step(scenes)
+    parts = _timed_parts(run)
+    started, cpu = time.perf_counter(), time.process_time()
+    for _ in range(steps):
+        run.one_step(_timed(scenes, parts))
+    seconds, cpu = time.perf_counter() - started, time.process_time() - cpu
+    scenes.close()
+    total_cpu = sum(entry["cpu"] for entry in run.team.gather([{"cpu": cpu}]))
+    parts["rendering and losses"] -= sum(parts[name] for name, _ in run.state.model.named_children())
+    parts["backward"] = seconds - sum(parts.values())
+    shares = {name: part / seconds for name, part in sorted(parts.items(), key=lambda item: -item[1])}
+    return {"seconds": seconds, "cpu": total_cpu, "scenes": steps * run.settings.batch, "parts": shares}
+
+
+def _timed_parts(run: "Run") -> dict[str, float]:
+    """Seconds by part of a step from now on: the network's forward stages, losses, exchange and optimiser."""
+    parts: dict[str, float] = defaultdict(float)
+
+    def timed(name: str, call: Callable[..., Any]) -> Callable[..., Any]:
+        def wrapped(*arguments: Any) -> Any:
+            started = time.perf_counter()
+            result = call(*arguments)
+            parts[name] += time.perf_counter() - started
+            return result
+
+        return wrapped
+
+    for name, stage in run.state.model.named_children():
+        stage.forward = timed(name, stage.forward)
+    changed: Any = run  # methods of single objects are replaced
+    changed.task.loss = timed("rendering and losses", run.task.loss)
+    changed.team.sum_gradients = timed("waiting and exchange", run.team.sum_gradients)
+    changed.state.update = timed("optimiser", run.state.update)
+    return parts
+
+
+def _timed(scenes: Iterator[Any], parts: dict[str, float]) -> Iterator[Any]:
+    """The same scenes; what is waited for them counts as a part."""
+    while True:
+        started = time.perf_counter()
+        scene = next(scenes)
+        parts["waiting for scenes"] += time.perf_counter() - started
+        yield scene
+
+
+if __name__ == "__main__":
+    _worker(sys.argv[1], Candidate(*json.loads(sys.argv[2])), int(sys.argv[3]))

@@ -1,0 +1,270 @@
+"""What competes in a benchmark, each in a fresh process: its memory is its own, and it sleeps while others run."""
+
+import json
+import multiprocessing
+import signal
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from math import prod
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..processes import safe_path
+
+# Of the square matrices whose product says what the machine can do: large enough to be as fast as it gets.
+MATRIX_SIDE = 2048
+MATRIX_FLOP = 2 * MATRIX_SIDE**3
+MATRIX_PRODUCTS = 3
+TIMES_PROFILED = 2
+NODE_SUFFIX = "_kernel_time"
+# Operators whose time is that of others inside them.
+LOOPS = ("Scan", "Loop", "If")
+# Operators whose FLOP are counted, as a graph has them before it is optimised.
+PRODUCTS = ("MatMul", "MatMulInteger", "Gemm", "Conv", "ConvTranspose")
+RUN = "run"
+
+
+@dataclass(frozen=True)
+class Workload:
+    """How many views of what size."""
+
+    views: int
+    height: int
+    width: int
+
+
+class Run(NamedTuple):
+    """One run of a contestant: its seconds, and what it gave."""
+
+    seconds: float
+    result: Any
+
+
+class Failed(Exception):
+    """A contestant cannot compete; the message says why."""
+
+
+Prepared = tuple[Any, Callable[[], Any]]
+
+
+class Worker:
+    """A contestant in its process, seen from the process that measures."""
+
+    def __init__(self, prepare: Callable[..., Prepared], *arguments: Any) -> None:
+        """Have `prepare` make ready what is to be run, and keep in `about` what it says of it. Raises Failed."""
+        context = multiprocessing.get_context("spawn")
+        self._pipe, other = context.Pipe()
+        self._process = context.Process(target=_serve, args=(other, prepare, arguments), daemon=True)
+        with safe_path():
+            self._process.start()
+        other.close()
+        self.about = self._answer()
+
+    def run(self) -> Run:
+        """Run it once. Raises Failed."""
+        self._pipe.send(RUN)
+        return self._answer()
+
+    def finish(self) -> int | None:
+        """End the process; the most bytes of memory that it held, where the system tells. Raises Failed."""
+        self._pipe.send(None)
+        peak = self._answer()
+        self._process.join()
+        return peak
+
+    def __enter__(self) -> "Worker":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End the process, whatever it does."""
+        self._process.kill()
+        self._process.join()
+
+    def _answer(self) -> Any:
+        try:
+            answer = self._pipe.recv()
+        except (EOFError, ConnectionError):
+            self._process.join()
+            raise Failed(f"its process ended with {self._process.exitcode}; memory may have run out") from None
+        if isinstance(answer, Failed):
+            raise answer
+        return answer
+
+
+def _serve(pipe: Connection, prepare: Callable[..., Prepared], arguments: tuple) -> None:
+    """A contestant's process: runs whenever it is told to."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # who measures decides when to stop
+    try:
+        about, run = prepare(*arguments)
+        pipe.send(about)
+        while pipe.recv() == RUN:
+            started = time.perf_counter()
+            result = run()
+            pipe.send(Run(time.perf_counter() - started, result))
+        pipe.send(peak_bytes())
+    except EOFError:  # who measures is gone
+        pass
+    except Exception as error:
+        pipe.send(Failed(" ".join(str(error).split()) or type(error).__name__))
+
+
+def peak_bytes() -> int | None:
+    """The most memory that this process held."""
+    try:  # getrusage would count the parent's, whose copy this process was for a moment
+        status = Path("/proc/self/status").read_text()
+        return int(status.partition("VmHWM:")[2].split()[0]) * 1024
+    except (OSError, IndexError):
+        pass
+    if sys.platform == "darwin":
+        import resource
+
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return None
+
+
+# ---- contestants: what they say of themselves, and what is run
+
+
+def matrix() -> Prepared:
+    """The product of two large matrices, in NumPy; a run gives FLOP a second.
+
+    The environment says how many threads NumPy takes: it has no other way.
+    """
+    left, right = np.random.default_rng(0).random((2, MATRIX_SIDE, MATRIX_SIDE), np.float32)
+
+    def run() -> float:
+        started = time.perf_counter()
+        for _ in range(MATRIX_PRODUCTS):
+            np.matmul(left, right)
+        return MATRIX_PRODUCTS * MATRIX_FLOP / (time.perf_counter() - started)
+
+    run()
+    return None, run
+
+
+def describe(model: Path) -> Prepared:
+    """What a model's file says of itself."""
+    from ...runtime.inference.predictor import Runner
+
+    return asdict(Runner(model).description), dict
+
+
+def exported(model: Path, provider: str, threads: int, workload: Workload) -> Prepared:
+    """An exported model; `about` holds how long it took to open, and the depth that it predicts."""
+    from ...runtime.inference.predictor import Runner
+    from ...runtime.inference.session import Tuning
+
+    started = time.perf_counter()
+    runner = Runner(model, provider, Tuning(threads))
+    load_seconds = time.perf_counter() - started
+    arrays = example_arrays(workload, runner.description.near, runner.description.far)
+
+    def run() -> None:
+        runner.predict_arrays(*arrays)
+
+    depth = runner.predict_arrays(*arrays).depth
+    return {"load_seconds": load_seconds, "depth": depth}, run
+
+
+def eager(preset: str, threads: int, workload: Workload) -> Prepared:
+    """A preset's network in PyTorch, with weights drawn at random: its time does not depend on them."""
+    import torch
+
+    from ...model.registry import build
+
+    torch.set_num_threads(threads)
+    torch.manual_seed(0)
+    started = time.perf_counter()
+    network = build(preset).eval()
+    config = network.config
+    tensors = [torch.from_numpy(array) for array in example_arrays(workload, config.near, config.far)]
+
+    def run() -> None:
+        with torch.inference_mode():
+            network(*tensors)
+
+    about = {"load_seconds": time.perf_counter() - started}
+    run()
+    return about, run
+
+
+def analyse(model: Path, provider: str, threads: int, workload: Workload) -> Prepared:
+    """Where a model's time goes and how much it computes, as `about`; there is nothing to run.
+
+    operators, stages: shares of the time, by name. flop: of its products of matrices and its convolutions.
+    """
+    from ...runtime.inference.session import CPU
+
+    kernels = _profile(model, provider, threads, workload, optimise=True)
+    operators: Counter[str] = Counter()
+    stages: Counter[str] = Counter()
+    for kernel in kernels:
+        if kernel["args"]["op_name"] in LOOPS:
+            continue
+        operators[kernel["args"]["op_name"]] += kernel["dur"]
+        scope = kernel["name"].split("/")
+        stages[scope[1] if len(scope) > 2 else "other"] += kernel["dur"]
+    plain = _profile(model, CPU, threads, workload, optimise=False)
+    flop = sum(flop_of(kernel["args"]) for kernel in plain)
+    return {"operators": _shares(operators), "stages": _shares(stages), "flop": flop}, dict
+
+
+def example_arrays(workload: Workload, near: float, far: float) -> tuple[np.ndarray, ...]:
+    """Pictures of coarse noise and cameras on a line, as a model's inputs in their order."""
+    views, height, width = workload.views, workload.height, workload.width
+    rng = np.random.default_rng(0)
+    coarse = rng.random((views, 3, height // 8 + 1, width // 8 + 1), np.float32)
+    images = np.repeat(np.repeat(coarse, 8, axis=2), 8, axis=3)[:, :, :height, :width]
+    extrinsics = np.tile(np.eye(4, dtype=np.float32), (views, 1, 1))
+    extrinsics[:, 0, 3] = near * np.linspace(-0.4, 0.4, views)
+    K = np.array([[0.9, 0, 0.5], [0, 0.9, 0.5], [0, 0, 1]], np.float32)
+    ranges = np.full(views, near, np.float32), np.full(views, far, np.float32)
+    return np.ascontiguousarray(images), extrinsics, np.tile(K, (views, 1, 1)), *ranges
+
+
+def _profile(model: Path, provider: str, threads: int, workload: Workload, optimise: bool) -> list[dict[str, Any]]:
+    """ONNX Runtime's notes on every operator of a run; where it is optimised, of one that is not the first."""
+    from ...runtime.inference.predictor import Runner
+    from ...runtime.inference.session import Tuning
+    from ...runtime.system.files import scratch_folder
+
+    with scratch_folder() as folder:
+        runner = Runner(model, provider, Tuning(threads, folder / "profile", optimise))
+        arrays = example_arrays(workload, runner.description.near, runner.description.far)
+        for _ in range(TIMES_PROFILED if optimise else 1):
+            runner.predict_arrays(*arrays)
+        return [kernel for path in runner.end_profiling() for kernel in last_kernels(path)]
+
+
+def last_kernels(profile: Path) -> list[dict[str, Any]]:
+    """The notes on the operators of the last run in a file that ONNX Runtime wrote."""
+    events = json.loads(profile.read_text())
+    last = max(event["ts"] for event in events if event["name"] == "model_run")
+    return [event for event in events if event["name"].endswith(NODE_SUFFIX) and event["ts"] >= last]
+
+
+def flop_of(args: dict[str, Any]) -> int:
+    """Floating-point operations of one operator, from the shapes in ONNX Runtime's notes."""
+    operator = args["op_name"]
+    if operator not in PRODUCTS:
+        return 0
+    first, second = (next(iter(entry.values())) for entry in args["input_type_shape"][:2])
+    result = next(iter(args["output_type_shape"][0].values()))
+    if operator == "Conv":
+        return 2 * prod(result) * prod(second[1:])
+    if operator == "ConvTranspose":
+        return 2 * prod(first) * prod(second[1:])
+    terms = prod(first) // result[0] if operator == "Gemm" else first[-1]
+    return 2 * prod(result) * terms
+
+
+def _shares(times: Counter[str]) -> dict[str, float]:
+    """Each name's share of the whole, largest first."""
+    whole = sum(times.values()) or 1
+    return {name: time / whole for name, time in times.most_common()}

@@ -1,0 +1,1 @@
+"""Evaluation on synthetic scenes, released datasets and real captures."""

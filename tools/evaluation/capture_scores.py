@@ -1,0 +1,168 @@
+"""One capture through an exported model: held-out frames rendered from pairs and from several views, and measured."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ...runtime.inference.predictor import Runner
+from ...runtime.splats.gaussians import Gaussians
+from .baselines import best_plane, nearest_view
+from .captures import PAIR, Capture, CaptureImages
+from .cases import Case
+from .metrics import LPIPS, fit_exposure, psnr, ssim
+from .novel_views import MODEL, NEAREST, PLANE, Scores, comparison_strip, draw
+
+PAIRS = "pairs"  # the model's result from the two views around each held-out frame
+
+Show = Callable[[str, np.ndarray], None]
+
+
+@dataclass(frozen=True)
+class TargetScores:
+    """The measures of a held-out frame, by method and measure."""
+
+    name: str
+    scores: Scores
+
+
+@dataclass(frozen=True)
+class CaseScores:
+    """One prediction: its context, the held-out frames, and its context frames rendered from all its Gaussians."""
+
+    context: list[str]
+    targets: list[TargetScores]
+    input_psnr: float
+    seconds: float
+
+
+@dataclass(frozen=True)
+class CaptureScores:
+    """The measures of a capture, by the number of context views; without numbers that it has too few views for."""
+
+    name: str
+    kind: str
+    cases: dict[int, list[CaseScores]] = field(default_factory=dict)
+
+    def mean(self, count: int) -> Scores:
+        """The mean over the held-out frames by method and measure, and of `input_psnr` over the cases."""
+        cases = self.cases[count]
+        targets = [target.scores for case in cases for target in case.targets]
+        means = {
+            method: {name: float(np.mean([scores[method][name] for scores in targets])) for name in measures}
+            for method, measures in targets[0].items()
+        }
+        means[MODEL]["input_psnr"] = float(np.mean([case.input_psnr for case in cases]))
+        return means
+
+
+class CaptureEvaluator:
+    """Measures a model on captures.
+
+    lpips: the measure, where it is installed.
+    """
+
+    def __init__(self, runner: Runner, lpips: LPIPS | None) -> None:
+        self.runner, self.lpips = runner, lpips
+
+    def evaluate(
+        self, capture: Capture, images: CaptureImages, counts: Sequence[int], show: Show | None = None
+    ) -> CaptureScores:
+        """The capture's triples if `counts` has 2, and its middle views for every other number of views.
+
+        Beside the held-out frames of those stand the nearest view and the best fronto-parallel plane (oracle), both of
+        the two views around each frame, and the model's own result from these two.
+        show: is given a name and a strip for each held-out frame: truth, render, error, depth and plane.
+        Raises InputError for what the model cannot take.
+        """
+        result = CaptureScores(capture.name, capture.kind)
+        pairs: dict[str, Scores] = {}
+        for count in counts:
+            if count == PAIR:
+                result.cases[count] = [
+                    self._triple(images.case(triple.context, [triple.target], self.runner.depth_range), show)
+                    for triple in capture.triples
+                ]
+                continue
+            context, targets = capture.window(count)
+            if not context:
+                continue
+            for target in targets:
+                if target not in pairs:
+                    triple = capture.neighbours(target)
+                    case = images.case(triple.context, [target], self.runner.depth_range)
+                    pairs[target] = self._triple(case, None).targets[0].scores
+            case = images.case(context, targets, self.runner.depth_range)
+            result.cases[count] = [self._window(case, pairs, show)]
+        return result
+
+    def _triple(self, case: Case, show: Show | None) -> CaseScores:
+        """A pair of views and one held-out frame, beside what other methods make of it."""
+        gaussians, seconds = self._predict(case)
+        pose, K = case.targets.extrinsics[0], case.targets.K(0)
+        truth, valid = case.targets.picture(0), case.targets.valid[0]
+        plane, _ = best_plane(case.context, truth, valid, pose, K, case.near, case.far)
+        rendering = draw(gaussians, case.targets, 0)
+        images = {MODEL: rendering.rgb, NEAREST: case.context.picture(nearest_view(case.context, pose)), PLANE: plane}
+        scores = {method: self._measure(image, truth, valid) for method, image in images.items()}
+        if show is not None:
+            show(_strip_name(case, 0), comparison_strip(truth, valid, rendering, plane))
+        return CaseScores(
+            case.context.names, [TargetScores(case.targets.names[0], scores)], _input_psnr(gaussians, case), seconds
+        )
+
+    def _window(self, case: Case, pairs: dict[str, Scores], show: Show | None) -> CaseScores:
+        """Several views and the held-out frames between them; pairs: the scores of each frame from its neighbours."""
+        gaussians, seconds = self._predict(case)
+        targets = []
+        for index, name in enumerate(case.targets.names):
+            truth, valid = case.targets.picture(index), case.targets.valid[index]
+            rendering = draw(gaussians, case.targets, index)
+            scores = {MODEL: self._measure(rendering.rgb, truth, valid), PAIRS: pairs[name][MODEL]}
+            scores |= {method: pairs[name][method] for method in (NEAREST, PLANE)}
+            targets.append(TargetScores(name, scores))
+            if show is not None:
+                show(_strip_name(case, index), comparison_strip(truth, valid, rendering, None))
+        return CaseScores(case.context.names, targets, _input_psnr(gaussians, case), seconds)
+
+    def _predict(self, case: Case) -> tuple[Gaussians, float]:
+        context, started = case.context, time.perf_counter()
+        prediction = self.runner.predict_arrays(
+            context.images, context.extrinsics, context.intrinsics, case.near, case.far
+        )
+        return prediction.need_gaussians(), time.perf_counter() - started
+
+    def _measure(self, image: np.ndarray, truth: np.ndarray, valid: np.ndarray) -> dict[str, float]:
+        scores = {
+            "psnr": psnr(image, truth, valid),
+            "psnr_fitted": psnr(fit_exposure(image, truth, valid), truth, valid),
+            "ssim": ssim(image, truth, valid),
+        }
+        if self.lpips is not None:
+            scores["lpips"] = self.lpips(image, truth, valid)
+        return scores
+
+
+def mean_of_captures(results: Sequence[CaptureScores], count: int) -> Scores:
+    """The mean over the captures that have `count` views, each with the same weight."""
+    means = [result.mean(count) for result in results if count in result.cases]
+    return {
+        method: {name: float(np.mean([mean[method][name] for mean in means])) for name in measures}
+        for method, measures in means[0].items()
+    }
+
+
+def _input_psnr(gaussians: Gaussians, case: Case) -> float:
+    """The mean PSNR of the context frames rendered from all Gaussians."""
+    context = case.context
+    values = [
+        psnr(draw(gaussians, context, view).rgb, context.picture(view), context.valid[view])
+        for view in range(len(context))
+    ]
+    return float(np.mean(values))
+
+
+def _strip_name(case: Case, target: int) -> str:
+    return f"{case.name}-{Path(case.targets.names[target]).stem}"

@@ -1,0 +1,94 @@
+"""What is evaluated: views that a network is given, and views that it is to meet."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...runtime.geometry.consistency import seen_from
+from ...runtime.splats.points import unproject
+
+# Depths that differ by less than this share are of one surface.
+SAME_SURFACE = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Posed:
+    """Pictures with their cameras at the network's size.
+
+    names: of the pictures, [views].
+    images: float32 RGB in [0, 1], [views, 3, height, width].
+    extrinsics: camera-to-world, OpenCV axes, [views, 4, 4].
+    intrinsics: row 0 divided by the width, row 1 by the height, [views, 3, 3].
+    valid: bool, [views, height, width]; False where the camera saw nothing and the picture was filled.
+    """
+
+    names: list[str]
+    images: np.ndarray
+    extrinsics: np.ndarray
+    intrinsics: np.ndarray
+    valid: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def picture(self, view: int) -> np.ndarray:
+        """One picture, [height, width, 3]."""
+        return self.images[view].transpose(1, 2, 0)
+
+    def K(self, view: int) -> np.ndarray:
+        """One view's intrinsics in pixels, pixel centres at .5, [3, 3], float64."""
+        height, width = self.images.shape[2:]
+        return np.diag([width, height, 1.0]) @ self.intrinsics[view]
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """Context views for a network, and target views of the same scene that it does not see.
+
+    near, far: the depth range, in scene units. depth: true z-depth of the context views in scene units,
+    [views, height, width], not positive where unknown; None where there is none.
+    seen: whether some context view sees what a pixel of a target shows, bool [targets, height, width]; None where that
+    is not known.
+    """
+
+    name: str
+    context: Posed
+    targets: Posed
+    near: float
+    far: float
+    depth: np.ndarray | None = None
+    seen: np.ndarray | None = None
+
+
+def procedural_case(
+    seed: int, context: int, drawn: int, targets: int, height: int, width: int, closer: int = 1
+) -> Case:
+    """The procedural scene of `seed`, with exact depth; the same arguments give the same case.
+
+    Of `drawn` context views along a path, `context` are given to the network: the first, the last, and evenly between.
+    closer: how many times as large targets are drawn as the context; they are windows of such pictures then.
+    """
+    from ..synthetic.sampler import draw_sample
+
+    sample = draw_sample(seed, drawn, targets, height, width, closer=(closer,) * targets)
+    given = np.linspace(0, drawn - 1, context).round().astype(int)
+
+    def posed(kind: str, views: np.ndarray | slice) -> Posed:
+        images = sample.images[views]
+        names = [f"{kind}{index}" for index in range(len(images))]
+        valid = np.ones((len(images), height, width), bool)
+        return Posed(names, images, sample.extrinsics[views], sample.intrinsics[views], valid)
+
+    chosen, met = posed("context", given), posed("target", slice(drawn, None))
+    depth = sample.depth[given]
+    seen = seen_by(unproject(sample.depth[drawn:], met.extrinsics, met.intrinsics), depth, chosen)
+    return Case(str(seed), chosen, met, sample.near, sample.far, depth, seen)
+
+
+def seen_by(points: np.ndarray, depth: np.ndarray, views: Posed) -> np.ndarray:
+    """Whether points [..., 3] are seen by some view, from the views' true z-depth [views, height, width]."""
+    seen = np.zeros(points.shape[:-1], bool)
+    for surface, extrinsics, intrinsics in zip(depth, views.extrinsics, views.intrinsics, strict=True):
+        pixel, z, inside = seen_from(points, surface.shape, extrinsics, intrinsics)
+        seen |= inside & (np.abs(surface.ravel()[pixel] - z) < SAME_SURFACE * z)
+    return seen

@@ -1,0 +1,208 @@
+"""The released datasets (RealEstate10K, ACID, DL3DV) as pixelSplat and its followers store and evaluate them.
+
+A `.torch` chunk is a list of scenes, each a dict of
+
+    key        the scene's name, which the evaluation index uses
+    cameras    float [frames, 18]: fx fy cx cy by width and height, two zeros, world-to-camera 3x4 in OpenCV axes
+    images     one uint8 tensor a frame, the bytes of a JPEG (RealEstate10K and ACID 640x360, DL3DV 480x270)
+
+beside `url` and `timestamps`, which nothing here needs. The evaluation index is a JSON object of scene names; each has
+null, which leaves the scene out, or the numbers of its frames: {"context": [58, 133], "target": [84, 102, 129]}.
+"""
+
+import io
+import json
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...runtime.errors import InputError, located
+from ...runtime.geometry.intrinsics import check_intrinsics
+from ...runtime.geometry.rigid import invert_rigid
+from ...runtime.images.resizing import cover, fit
+from ...runtime.system.files import check_regular, read_bytes
+from .cases import Case, Posed
+
+CAMERA_NUMBERS = 18
+FIRST_POSE_NUMBER = 6
+# Of the near plane: the releases' renderer draws no Gaussian that is nearer to the camera.
+NEAREST_DRAWN = 0.2
+INSTALL = "pip install 'idesplat[eval]'"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What the evaluation index asks of a scene: numbers of frames."""
+
+    context: list[int]
+    target: list[int]
+
+
+def read_index(path: Path) -> dict[str, Entry]:
+    """The scenes of a published evaluation index that are not left out; raises InputError if it is none, or empty."""
+    try:
+        content = json.loads(read_bytes(path, "an evaluation index"))
+    except InputError:
+        raise
+    except RecursionError:
+        raise InputError(f"{path}: is JSON nested too deeply; expected an evaluation index") from None
+    except ValueError as error:
+        raise InputError(f"{path}: is not valid JSON ({error}); expected an evaluation index") from None
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: holds a {type(content).__name__}, expected an object of scenes")
+    if content and all(isinstance(value, str) for value in content.values()):
+        raise InputError(
+            f"{path}: lists chunk files; expected an evaluation index, such as evaluation_index_re10k.json"
+        )
+    index = {key: _entry(value, f"{path}: {key}") for key, value in content.items() if value is not None}
+    if not index:
+        raise InputError(f"{path}: names no scene to evaluate; expected an evaluation index")
+    return index
+
+
+def find_chunks(folder: Path) -> list[Path]:
+    """The `.torch` files of a folder, in order; raises InputError if there is none."""
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; give the one that holds the .torch chunks")
+    found = sorted(folder.glob("*.torch"))
+    if not found:
+        inside = sorted({path.parent for path in folder.glob("*/*.torch")})
+        instead = f", such as {inside[0]}" if inside else ""
+        raise InputError(f"{folder}: no .torch chunks in this folder; give the one that holds them{instead}")
+    return found
+
+
+def read_chunk(path: Path) -> list[dict[str, Any]]:
+    """The scenes of a chunk, checked but for what images and poses hold; loads data only and never runs code in it.
+
+    Raises InputError if it cannot be loaded so, or is no list of scenes.
+    """
+    if find_spec("torch") is None:
+        raise InputError(f"{path}: PyTorch is needed to read chunks, and is not installed; {INSTALL}")
+    import torch
+
+    check_regular(path)
+    try:
+        with warnings.catch_warnings(action="ignore"):  # torch warns of what it is about to refuse
+            scenes = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # damaged files make torch raise many kinds
+        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise InputError(f"{path}: is damaged or holds more than data ({reason}); download it again") from None
+    if not isinstance(scenes, list) or not all(isinstance(scene, dict) for scene in scenes):
+        raise InputError(f"{path}: holds a {type(scenes).__name__}, expected a list of scenes (dicts)")
+    for number, scene in enumerate(scenes):
+        _check_scene(scene, f"{path}: scene {number}")
+    return scenes
+
+
+def chunk_cases(
+    chunks: list[Path],
+    index: dict[str, Entry],
+    size: tuple[int, int],
+    depth_range: tuple[float, float],
+    skip: Callable[[str, str], None],
+) -> Iterator[Case]:
+    """The indexed scenes of the chunks, in their order, prepared as the papers do; `skip` hears a scene and why.
+
+    size: height and width. depth_range: near and far, the same for all scenes.
+    Scenes with a damaged picture or an impossible pose are skipped, as the releases do. Raises InputError as
+    `read_chunk` does, and for frames that a scene has not.
+    """
+    for path in chunks:
+        for scene in read_chunk(path):
+            entry = index.get(scene["key"])
+            if entry is None:
+                continue
+            last = max(*entry.context, *entry.target)
+            if last >= len(scene["images"]):
+                raise InputError(
+                    f"{path}: scene {scene['key']} has {len(scene['images'])} frames and the index asks for number "
+                    f"{last}; give the index that was made for this dataset"
+                )
+            try:
+                context, targets = (_posed(scene, frames, *size) for frames in (entry.context, entry.target))
+            except InputError as error:
+                skip(scene["key"], str(error))
+                continue
+            yield Case(scene["key"], context, targets, *depth_range)
+
+
+def _entry(value: object, where: str) -> Entry:
+    if isinstance(value, dict) and _are_frames(value.get("context")) and _are_frames(value.get("target")):
+        return Entry(value["context"], value["target"])
+    raise InputError(f'{where}: expected null, or {{"context": [...], "target": [...]}} with numbers of frames')
+
+
+def _are_frames(value: object) -> bool:
+    return isinstance(value, list) and len(value) > 0 and all(type(x) is int and x >= 0 for x in value)
+
+
+def _check_scene(scene: dict[str, Any], where: str) -> None:
+    """Raise InputError unless a scene has its fields, each of the right type and shape."""
+    import torch
+
+    key, cameras, images = scene.get("key"), scene.get("cameras"), scene.get("images")
+    if not isinstance(key, str) or Path(key).name != key:
+        raise InputError(f"{where}: key is {key!r:.60}, expected the scene's name")
+    if not isinstance(cameras, torch.Tensor) or cameras.ndim != 2 or cameras.shape[1] != CAMERA_NUMBERS:
+        shape = list(cameras.shape) if isinstance(cameras, torch.Tensor) else type(cameras).__name__
+        raise InputError(f"{where} ({key}): cameras is {shape}, expected a tensor [frames, {CAMERA_NUMBERS}]")
+    if not isinstance(images, list) or len(images) != len(cameras):
+        count = len(images) if isinstance(images, list) else type(images).__name__
+        raise InputError(f"{where} ({key}): images is {count}, expected one for each of {len(cameras)} cameras")
+    for number, image in enumerate(images):
+        if not isinstance(image, torch.Tensor) or image.dtype != torch.uint8 or image.ndim != 1:
+            raise InputError(f"{where} ({key}): images[{number}] is no uint8 tensor [bytes] of a JPEG file")
+
+
+def _posed(scene: dict[str, Any], frames: list[int], height: int, width: int) -> Posed:
+    images, intrinsics, extrinsics = [], [], []
+    for frame in frames:
+        with located(f"frame {frame}"):
+            K, pose = _camera(scene["cameras"][frame].numpy().astype(np.float64))
+            image, k = _fitted(_decoded(scene["images"][frame].numpy()), K, height, width)
+        images.append(image)
+        intrinsics.append(k)
+        extrinsics.append(pose)
+    names = [str(frame) for frame in frames]
+    valid = np.ones((len(frames), height, width), bool)
+    return Posed(names, np.stack(images), np.stack(extrinsics), np.stack(intrinsics), valid)
+
+
+def _camera(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A row of `cameras` [18] as normalised intrinsics [3, 3] and camera-to-world pose [4, 4]."""
+    fx, fy, cx, cy = numbers[:4]
+    intrinsics = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    check_intrinsics(intrinsics, 1, 1)
+    world_to_camera = np.vstack([numbers[FIRST_POSE_NUMBER:].reshape(3, 4), [0, 0, 0, 1]])
+    return intrinsics, invert_rigid(world_to_camera)
+
+
+def _decoded(content: np.ndarray) -> np.ndarray:
+    """The picture in the bytes of a JPEG file, RGB [height, width, 3] in uint8."""
+    from PIL import Image
+
+    try:
+        with Image.open(io.BytesIO(content.tobytes())) as picture:
+            return np.asarray(picture.convert("RGB"))
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise InputError(f"the picture cannot be decoded ({error})") from None
+
+
+def _fitted(image: np.ndarray, K: np.ndarray, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """The picture covering height x width, float32 [3, height, width], and its normalised intrinsics [3, 3].
+
+    The papers scale with Pillow's Lanczos filter, which is sharper than what `fit` does for photographs. On three views
+    of real photographs that alone cost a warped plane 0.3 to 0.6 dB.
+    """
+    from PIL import Image
+
+    full_height, full_width = image.shape[:2]
+    crop = cover(full_width, full_height, width, height)
+    scaled = Image.fromarray(image).resize((crop.width, crop.height), Image.Resampling.LANCZOS)
+    return fit(np.asarray(scaled), np.diag([crop.width, crop.height, 1.0]) @ K, height, width)

@@ -1,0 +1,166 @@
+"""One case through an exported model: its target views drawn, and measured beside what other methods make of them."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ...runtime.geometry.rigid import invert_rigid
+from ...runtime.images.writing import depth_colours
+from ...runtime.inference.predictor import Runner
+from ...runtime.rendering.rasterizer import rasterize
+from ...runtime.rendering.types import Rendering
+from ...runtime.splats.gaussians import Gaussians
+from .baselines import best_plane, nearest_view, splats_at
+from .cases import Case, Posed
+from .metrics import LPIPS, depth_measures, psnr, ssim
+
+MODEL, NEAREST, PLANE, TRUE_DEPTH = "model", "nearest", "plane", "true depth"
+# World units from the camera at which Gaussians begin to be drawn, where nothing else is asked for.
+NEAREST_DRAWN = 0.01
+# A mean difference of the colours from here on has the brightest colour.
+WORST_ERROR = 0.3
+# Where less of the light is stopped, there is no depth to show.
+LEAST_ALPHA = 0.05
+GAP = 4  # white pixels between the pictures of a strip
+
+# Values by method and measure.
+Scores = dict[str, dict[str, float]]
+
+
+@dataclass(frozen=True)
+class Target:
+    """The measures of a target view, by method and measure.
+
+    details: what the other methods found, the nearest view's name and the plane's depth in scene units.
+    """
+
+    name: str
+    scores: Scores
+    details: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Result:
+    """What was measured of a case; depth: AbsRel and its like, where the context's depth is known."""
+
+    name: str
+    context: list[str]
+    near: float
+    far: float
+    targets: list[Target]
+    depth: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Evaluator:
+    """A model and how it is measured.
+
+    lpips: the measure, where it is there. compare: whether other methods are measured, too.
+    nearest_drawn: scene units from the camera at which Gaussians begin to be drawn.
+    """
+
+    runner: Runner
+    lpips: LPIPS | None
+    compare: bool = True
+    nearest_drawn: float = NEAREST_DRAWN
+
+    def evaluate(self, case: Case, show: Callable[[str, np.ndarray], None] | None = None) -> Result:
+        """Predict from the context, draw the targets and measure them.
+
+        show: is given each target's name and strip: truth, render, error, depth and, if measured, the plane; RGB in
+        [0, 1], [height, all widths, 3]. Raises InputError for what the model cannot take.
+        """
+        given = case.context
+        prediction = self.runner.predict_arrays(given.images, given.extrinsics, given.intrinsics, case.near, case.far)
+        exact = None
+        if self.compare and case.depth is not None and (case.depth > 0).all():
+            exact = splats_at(case.depth, given)
+        targets = []
+        for view, name in enumerate(case.targets.names):
+            truth, valid = case.targets.picture(view), case.targets.valid[view]
+            drawn = draw(prediction.need_gaussians(), case.targets, view, self.nearest_drawn)
+            pictures: dict[str, np.ndarray] = {MODEL: drawn.rgb}
+            details: dict[str, Any] = {}
+            if self.compare:
+                others, details = self._others(case, view, exact)
+                pictures |= others
+            seen = None if case.seen is None else case.seen[view] & valid
+            scores = {method: self._measure(picture, truth, valid, seen) for method, picture in pictures.items()}
+            targets.append(Target(name, scores, details))
+            if show is not None:
+                show(name, comparison_strip(truth, valid, drawn, pictures.get(PLANE)))
+        depth = {} if case.depth is None else depth_measures(prediction.depth, case.depth)
+        return Result(case.name, given.names, case.near, case.far, targets, depth)
+
+    def _others(self, case: Case, view: int, exact: Gaussians | None) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Other methods' pictures of a target, [height, width, 3], and what they found; exact: splats at true depth."""
+        context, targets, pose = case.context, case.targets, case.targets.extrinsics[view]
+        copied = nearest_view(context, pose)
+        truth, valid = targets.picture(view), targets.valid[view]
+        plane, depth = best_plane(context, truth, valid, pose, targets.K(view), case.near, case.far)
+        pictures = {NEAREST: context.picture(copied), PLANE: plane}
+        if exact is not None:
+            pictures[TRUE_DEPTH] = draw(exact, targets, view, self.nearest_drawn).rgb
+        return pictures, {"nearest_view": context.names[copied], "plane_depth": depth}
+
+    def _measure(
+        self, picture: np.ndarray, truth: np.ndarray, valid: np.ndarray, seen: np.ndarray | None
+    ) -> dict[str, float]:
+        scores = {"psnr": psnr(picture, truth, valid), "ssim": ssim(picture, truth, valid)}
+        if seen is not None:
+            scores["psnr_seen"] = psnr(picture, truth, seen)
+        if self.lpips is not None:
+            scores["lpips"] = self.lpips(picture, truth, valid)
+        return scores
+
+
+def mean_of_views(results: Sequence[Result]) -> Scores:
+    """The mean of every method's measures over all target views; those of depth, over the scenes, are the model's."""
+    means = _mean([target.scores for result in results for target in result.targets])
+    means[MODEL] |= _mean([{MODEL: result.depth} for result in results])[MODEL]
+    return means
+
+
+def mean_of_scenes(results: Sequence[Result]) -> Scores:
+    """As the papers count: the mean over the scenes of their means over the target views."""
+    return _mean([mean_of_views([result]) for result in results])
+
+
+def draw(gaussians: Gaussians, targets: Posed, view: int, nearest_drawn: float = NEAREST_DRAWN) -> Rendering:
+    """The Gaussians from a target camera at its picture's size, on black."""
+    height, width = targets.images.shape[2:]
+    return rasterize(
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales,
+        gaussians.opacities,
+        gaussians.sh,
+        invert_rigid(targets.extrinsics[view]),
+        targets.K(view),
+        width,
+        height,
+        near=nearest_drawn,
+    )
+
+
+def _mean(entries: list[Scores]) -> Scores:
+    """The mean of entries that all have the same methods and measures."""
+    return {
+        method: {measure: float(np.mean([entry[method][measure] for entry in entries])) for measure in measures}
+        for method, measures in entries[0].items()
+    }
+
+
+def comparison_strip(truth: np.ndarray, valid: np.ndarray, drawn: Rendering, plane: np.ndarray | None) -> np.ndarray:
+    """Truth, render, error (black where nothing is measured), depth and plane side by side."""
+    error = np.abs(drawn.rgb.clip(0, 1) - truth).mean(axis=2) * valid / WORST_ERROR
+    hot = cv2.applyColorMap(np.rint(255 * error.clip(0, 1)).astype(np.uint8), cv2.COLORMAP_INFERNO)
+    depth = np.where(drawn.alpha > LEAST_ALPHA, drawn.depth / np.maximum(drawn.alpha, LEAST_ALPHA), 0)
+    pictures = [truth, drawn.rgb, hot[..., ::-1].astype(np.float32) / 255, depth_colours(depth)]
+    if plane is not None:
+        pictures.append(plane)
+    white = np.ones((len(truth), GAP, 3), np.float32)
+    return np.concatenate([part for picture in pictures for part in (white, picture)][1:], axis=1)

@@ -1,0 +1,83 @@
+"""What an evaluation leaves: tables on the terminal, and results.json."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from ...runtime.cli.terminal import literal, say
+from ...runtime.system.files import replacing
+from .novel_views import MODEL, Result, Scores
+
+RESULTS = "results.json"
+TITLES = {
+    "psnr": "PSNR, dB",
+    "psnr_seen": "PSNR where seen, dB",
+    "ssim": "SSIM",
+    "lpips": "LPIPS",
+    "abs_rel": "AbsRel",
+    "within_5_percent": "within 5 %",
+}
+DECIMALS = {"psnr": 2, "psnr_seen": 2}
+USUAL_DECIMALS = 3
+WIDTH = 110  # columns, where there is no terminal to ask
+
+
+def print_views(results: Sequence[Result]) -> None:
+    """A row for each target view, with every method's measures."""
+    scores = results[0].targets[0].scores
+    columns = [(measure, method) for measure in scores[MODEL] for method in scores]
+    table = Table()
+    table.add_column("target", no_wrap=True)
+    table.add_column("from")
+    for measure, method in columns:
+        heading = TITLES[measure] if method == MODEL else ""
+        table.add_column(f"{heading}\n{method}", justify="right", no_wrap=True)
+    for result in results:
+        for target in result.targets:
+            cells = [_number(measure, target.scores[method][measure]) for measure, method in columns]
+            table.add_row(literal(target.name), literal(", ".join(result.context)), *cells)
+    print_table(table)
+
+
+def print_means(means: Scores, title: str) -> None:
+    """A title, then a row for each measure's mean, a column for each method, and what the model gains."""
+    table = Table()
+    table.add_column("mean")
+    for method in means:
+        table.add_column(method, justify="right")
+    compared = [method for method in means if method != MODEL]
+    for method in compared:
+        table.add_column(f"over {method}", justify="right")
+    for measure, value in means[MODEL].items():
+        others = [means[method].get(measure) for method in compared]
+        cells = ["" if other is None else _number(measure, other) for other in others]
+        gains = ["" if other is None else _number(measure, value - other, sign="+") for other in others]
+        table.add_row(TITLES[measure], _number(measure, value), *cells, *gains)
+    say(title)
+    print_table(table)
+
+
+def write_results(folder: Path, about: dict[str, Any], means: Scores, results: Sequence[Result]) -> Path:
+    """Write `results.json`: what was evaluated, the means, every scene and every target; returns its path."""
+    content = {**about, "mean": means, "scenes": [asdict(result) for result in results]}
+    path = folder / RESULTS
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=1) + "\n")
+    return path
+
+
+def _number(measure: str, value: float, sign: str = "") -> str:
+    return f"{value:{sign}.{DECIMALS.get(measure, USUAL_DECIMALS)}f}"
+
+
+def print_table(table: Table) -> None:
+    """Print a table, at a set width where there is no terminal."""
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=WIDTH)
+    console.print(table)

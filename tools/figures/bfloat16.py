@@ -1,0 +1,101 @@
+"""How far depth moves where one part of a network multiplies in bfloat16: numbers for docs/performance.md.
+
+python -P -m idesplat.tools.figures.bfloat16 [MODEL]
+
+What a processor does that multiplies in bfloat16 and adds in float32 is done by hand: operands are rounded before.
+"""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import onnx
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from ...runtime.cli.terminal import run
+from ...runtime.errors import exit_on_input_error
+from ...runtime.inference.bundled_model import default_model
+from ...runtime.inference.predictor import Runner
+from ...runtime.inference.session import open_session, run_session
+from ..evaluation.cases import procedural_case
+from ..synthetic.sampler import HELD_OUT_SEEDS
+
+PRODUCTS = ("MatMul", "Conv", "ConvTranspose")
+VIEWS = 2
+
+
+@exit_on_input_error
+def main(
+    model: Annotated[Path | None, typer.Argument(help="A .onnx file instead of the carried model.")] = None,
+    scenes: Annotated[int, typer.Option(help="Held-out drawn scenes to measure on.", min=1)] = 3,
+) -> None:
+    """Round the operands of one part after the other, and compare depth with that of the model as it is."""
+    path = model or default_model()
+    own = Runner(path).description
+    cases = [procedural_case(seed, VIEWS, VIEWS, 1, own.height, own.width) for seed in HELD_OUT_SEEDS[:scenes]]
+    feeds = [
+        {
+            "images": case.context.images,
+            "extrinsics": case.context.extrinsics,
+            "intrinsics": case.context.intrinsics,
+            "near": np.full(VIEWS, case.near, np.float32),
+            "far": np.full(VIEWS, case.far, np.float32),
+        }
+        for case in cases
+    ]
+    graph = onnx.load(path)
+    exact = _depths(graph, feeds)
+    table = Table("part", "all its products", "those with weights", title="median relative change of depth, largest")
+    parts = dict.fromkeys(node.name.split("/")[1] for node in graph.graph.node if node.op_type in PRODUCTS)
+    with Console(stderr=True).status("rounding") as status:
+        for part in parts:
+            status.update(f"rounding {part}")
+            found = [_depths(_rounded(graph, part, weighted), feeds) for weighted in (False, True)]
+            table.add_row(part, *(f"{_change(depths, exact):.0e}" for depths in found))
+    Console().print(table)
+
+
+def _rounded(graph: onnx.ModelProto, part: str, weighted: bool) -> onnx.ModelProto:
+    """A graph whose products in one part, or those of them with trained weights, read operands in bfloat16."""
+    copy = onnx.ModelProto()
+    copy.CopyFrom(graph)
+    weights = {tensor.name for tensor in graph.graph.initializer}
+    nodes: list[onnx.NodeProto] = []
+    rounded: set[str] = set()
+    for node in copy.graph.node:
+        inside = node.op_type in PRODUCTS and node.name.startswith(f"/{part}/")
+        if inside and (not weighted or node.input[1] in weights):
+            for index, name in enumerate(node.input[:2]):
+                if name not in rounded:
+                    nodes += _rounding(name)
+                    rounded.add(name)
+                node.input[index] = f"{name}.rounded"
+        nodes.append(node)
+    del copy.graph.node[:]
+    copy.graph.node.extend(nodes)
+    return copy
+
+
+def _rounding(name: str) -> tuple[onnx.NodeProto, onnx.NodeProto]:
+    """Nodes that take a tensor to bfloat16 and back."""
+    short = f"{name}.bfloat16"
+    return (
+        onnx.helper.make_node("Cast", [name], [short], name=short, to=onnx.TensorProto.BFLOAT16),
+        onnx.helper.make_node("Cast", [short], [f"{name}.rounded"], name=f"{name}.rounded", to=onnx.TensorProto.FLOAT),
+    )
+
+
+def _depths(graph: onnx.ModelProto, feeds: list[dict[str, np.ndarray]]) -> list[np.ndarray]:
+    session = open_session(graph.SerializeToString())
+    return [run_session(session, feed)["depth"] for feed in feeds]
+
+
+def _change(found: list[np.ndarray], exact: list[np.ndarray]) -> float:
+    """The median relative difference of the scene in which it is largest."""
+    return max(float(np.median(np.abs(a / b - 1))) for a, b in zip(found, exact, strict=True))
+
+
+if __name__ == "__main__":
+    run(main)

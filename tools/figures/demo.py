@@ -1,0 +1,45 @@
+"""The main job on a scene drawn here: photographs and cameras, and what the carried model makes of them.
+
+python -P -m idesplat.tools.figures.demo demo
+"""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ...runtime.cli.infer import infer
+from ...runtime.cli.outputs import Overwrite, guards_outputs, outputs
+from ...runtime.cli.terminal import run
+from ...runtime.errors import exit_on_input_error
+from ..synthetic.make_scene import make_scene
+
+
+@exit_on_input_error
+@guards_outputs("demo")
+def demo(
+    out: Annotated[Path, typer.Argument(help="Folder for everything.")] = Path("demo"), overwrite: Overwrite = False
+) -> None:
+    """Draw a room, and turn two photographs of it into splats, depth maps and views."""
+    scene = out / "scene"
+    outputs().writes("", [out / "scene.ply", out / "summary.json"])
+    make_scene(scene, seed=2, views=8, height=480, width=640, overwrite=overwrite)
+    infer(
+        images=[scene / "images"],
+        cameras=str(scene / "transforms.json"),
+        out=out / "scene.ply",
+        save_depth=out / "depth",
+        render=out / "views",
+        timings=True,
+        json_path=out / "summary.json",
+        overwrite=overwrite,
+    )
+
+
+def main() -> None:
+    """Run the command."""
+    run(demo)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,51 @@
+"""The README's picture: what the carried model makes of two photographs of the drawn room.
+
+python -P -m idesplat.tools.figures.readme_picture demo/scene docs/picture.png
+"""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from ...runtime.cameras.io import read_cameras
+from ...runtime.cli.terminal import run, say
+from ...runtime.errors import exit_on_input_error
+from ...runtime.images.writing import depth_colours, save_png
+from ...runtime.inference.bundled_model import default_model
+from ...runtime.inference.predictor import Runner
+from ...runtime.rendering.render_view import draw_view
+from ...runtime.views.batch import prepare
+
+# Two photographs, and one between them that the model is not given.
+CONTEXT, BETWEEN = (1, 3), 2
+
+
+@exit_on_input_error
+def picture(
+    scene: Annotated[Path, typer.Argument(help="Folder that make_scene wrote.", show_default=False)],
+    out: Annotated[Path, typer.Argument(help="The .png to write.", show_default=False)],
+) -> None:
+    """Draw photograph, its depth, the view between from splats, the photograph there, and the other photograph."""
+    cameras = read_cameras(scene / "transforms.json")
+    runner = Runner(default_model())
+    height, width = runner.size_for(cameras)
+    pairs = [(scene / cameras[view].name, cameras[view]) for view in (*CONTEXT, BETWEEN)]
+    given = prepare(pairs[: len(CONTEXT)], None, height, width)
+    found = runner.predict_views(given)
+    views = prepare(pairs, None, height, width)
+    pixels = views.intrinsics[-1].astype(np.float64) * np.array([width, height, 1.0])[:, None]
+    between = draw_view(found.need_gaussians(), views.extrinsics[-1], pixels, width, height).rgb
+    first, second, truth = views.images.transpose(0, 2, 3, 1)
+    save_png(out, np.hstack([first, depth_colours(found.depth[0]), between, truth, second]).astype(np.float32))
+    say(f"wrote {out}")
+
+
+def main() -> None:
+    """Run the command."""
+    run(picture)
+
+
+if __name__ == "__main__":
+    main()

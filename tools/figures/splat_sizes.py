@@ -1,0 +1,71 @@
+"""How large a pixel's splat should be: PSNR by size, of views as large as the photographs and closer.
+
+    python -P -m idesplat.tools.figures.splat_sizes --scenes 24
+
+Small splats hide little of their neighbours and are best at the photographs' own size; seen closer they leave gaps.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from ...runtime.cli.terminal import run
+from ...runtime.errors import exit_on_input_error
+from ...runtime.inference.bundled_model import default_model
+from ...runtime.inference.predictor import Runner
+from ...runtime.splats.gaussians import Gaussians
+from ..evaluation.baselines import SPLAT_PIXELS, splats_at
+from ..evaluation.cases import Case, procedural_case
+from ..evaluation.metrics import psnr
+from ..evaluation.novel_views import draw
+from ..synthetic.sampler import HELD_OUT_SEEDS
+
+CLOSER = (1, 2, 4)
+SIZES = (0.3, 0.35, 0.4, 0.45, 0.5, 0.6)  # pixels
+VIEWS, TARGETS = 2, 2
+OWN = "model"
+
+
+@exit_on_input_error
+def main(
+    model: Annotated[Path | None, typer.Argument(help="A .onnx file instead of the carried model.")] = None,
+    scenes: Annotated[int, typer.Option(help="Held-out drawn scenes.", min=1)] = 24,
+) -> None:
+    """Draw held-out scenes from splats of several sizes at the true depth, and from the model's own, where seen."""
+    runner = Runner(model or default_model())
+    table = Table(
+        "times as large", *(f"{size:g} pixels" for size in SIZES), OWN, title="PSNR, dB, where some input sees"
+    )
+    console = Console(stderr=True)
+    for closer in CLOSER:
+        seeds = track(HELD_OUT_SEEDS[:scenes], f"{closer} times as large", console=console, transient=True)
+        rows = [row for seed in seeds for row in _measured(runner, seed, closer)]
+        table.add_row(str(closer), *(f"{value:.2f}" for value in np.mean(rows, axis=0)))
+    Console().print(table)
+
+
+def _measured(runner: Runner, seed: int, closer: int) -> list[list[float]]:
+    """For each target of a scene its PSNR, dB, by size of the splats, and last by the model's own."""
+    own = runner.description
+    case = procedural_case(seed, VIEWS, VIEWS, TARGETS, own.height, own.width, closer)
+    given = case.context
+    predicted = runner.predict_arrays(given.images, given.extrinsics, given.intrinsics, case.near, case.far)
+    assert case.depth is not None
+    rule = splats_at(case.depth, given)
+    scenes = [replace(rule, scales=rule.scales * np.float32(size / SPLAT_PIXELS)) for size in SIZES]
+    return [[_psnr(scene, case, view) for scene in (*scenes, predicted.need_gaussians())] for view in range(TARGETS)]
+
+
+def _psnr(gaussians: Gaussians, case: Case, view: int) -> float:
+    assert case.seen is not None
+    return psnr(draw(gaussians, case.targets, view).rgb, case.targets.picture(view), case.seen[view])
+
+
+if __name__ == "__main__":
+    run(main)

@@ -1,0 +1,1 @@
+"""Synthetic scenes: layout, textures and a ray caster."""

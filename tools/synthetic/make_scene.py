@@ -1,0 +1,138 @@
+"""The command `python -P -m idesplat.tools.synthetic.make_scene`: a procedural room as photographs, cameras and depth.
+
+    OUT_DIR/images/000.png ...     the photographs
+    OUT_DIR/transforms.json        their cameras, as nerfstudio writes them
+    OUT_DIR/depth/000.npz ...      exact z-depth at the pixel centres, `depth` [height, width], in scene units
+
+What needs photographs with known cameras and known truth can be tried on it, without a download.
+"""
+
+import json
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import typer
+
+from ...runtime.cli.outputs import Overwrite, guards_outputs, outputs
+from ...runtime.cli.terminal import run, say
+from ...runtime.errors import exit_on_input_error
+from ...runtime.system.files import replacing
+
+if TYPE_CHECKING:  # compiled code is loaded only once there is something to draw
+    from .layout import Layout
+
+OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
+SEED = 2  # a room that is pleasant to look at
+FIELD_OF_VIEW = 62.0  # degrees, of the longer side
+PATH_LENGTH = 0.3  # of the median depth, from the first view to the last
+SAMPLES = 12  # rays for a pixel's colour
+BRIGHTNESS = 0.45  # mean of all pictures
+CANDIDATES = 60  # paths, of which the one with the richest views is taken
+CLEARANCE = 0.3  # of the median depth, before every camera
+LAMP = 0.3  # half length of the lamp that casts shadows, in scene units
+
+
+@exit_on_input_error
+@guards_outputs("make_scene")
+def make_scene(
+    out_dir: Annotated[Path, typer.Argument(help="Folder to write to.", show_default=False)],
+    seed: Annotated[int, typer.Option(help="Another number gives another room.", min=0)] = SEED,
+    views: Annotated[int, typer.Option(help="Photographs, along a gentle path.", min=2, max=1000)] = 8,
+    height: Annotated[int, typer.Option(help="Of a photograph, in pixels.", min=16, max=8192)] = 480,
+    width: Annotated[int, typer.Option(help="Of a photograph, in pixels.", min=16, max=8192)] = 640,
+    overwrite: Overwrite = False,
+) -> None:
+    """Draw photographs of a furnished room that exists only in numbers, with its cameras and exact depth."""
+    from ...runtime.images.writing import save_png
+    from .layout import furnished_room
+    from .sampler import photograph, scene_textures
+
+    images, depths, cameras = out_dir / "images", out_dir / "depth", out_dir / "transforms.json"
+    names = [f"{index:03}" for index in range(views)]
+    files = [images / f"{name}.png" for name in names] + [depths / f"{name}.npz" for name in names]
+    outputs().writes("", [*files, cameras])
+    rng = np.random.default_rng(seed)
+    bank = scene_textures(seed)
+    layout = furnished_room(rng, bank)
+    intrinsics = _intrinsics(width, height)
+    scene = layout.scene._replace(light_lengths=np.where(np.arange(len(layout.scene.light_lengths)) == 0, LAMP, -1.0))
+    poses = _path(rng, layout, intrinsics, views)
+
+    exposure = 1.0
+    for index, pose in enumerate(_with_progress(poses)):
+        image, depth = photograph(scene, bank, pose, intrinsics, height, width, SAMPLES)
+        if index == 0:
+            exposure = BRIGHTNESS / max(float(image.mean()), 1e-3)
+        save_png(images / f"{index:03}.png", exposure * image)
+        with replacing(depths / f"{index:03}.npz") as temporary:
+            np.savez_compressed(temporary, depth=depth)
+    with replacing(cameras) as temporary:
+        temporary.write_text(json.dumps(_transforms(poses, intrinsics, width, height), indent=1) + "\n")
+    say(f"{views} photographs in {images}, their cameras in {cameras}, true depth in {depths}")
+
+
+def main() -> None:
+    """Run the command."""
+    run(make_scene)
+
+
+def _intrinsics(width: int, height: int) -> np.ndarray:
+    """A camera of FIELD_OF_VIEW, row 0 divided by the width, row 1 by the height, [3, 3]."""
+    focal = 0.5 / np.tan(np.radians(FIELD_OF_VIEW) / 2) * max(width, height)  # pixels
+    return np.array([[focal / width, 0, 0.5], [0, focal / height, 0.5], [0, 0, 1]])
+
+
+def _path(rng: np.random.Generator, layout: "Layout", intrinsics: np.ndarray, views: int) -> np.ndarray:
+    """Camera-to-world poses [views, 4, 4] on a shallow arc: the one of CANDIDATES whose ends see the most relief."""
+    from .sampler import look_at, probe, relief
+
+    best, best_score = np.empty(0), -np.inf
+    for _ in range(CANDIDATES):
+        middle = look_at(rng.uniform(*layout.eyes), rng.uniform(*layout.focus))
+        distance = float(np.median(probe(layout.scene, middle, intrinsics)))
+        poses = _arc(middle, distance, views)
+        seen = [probe(layout.scene, pose, intrinsics) for pose in (poses[0], middle, poses[-1])]
+        room_before = min(depth.min() for depth in seen) / distance
+        score = min(relief(depth) for depth in seen) if room_before > CLEARANCE else room_before - CLEARANCE
+        if score > best_score:
+            best, best_score = poses, score
+    return best
+
+
+def _arc(middle: np.ndarray, distance: float, views: int) -> np.ndarray:
+    """Poses [views, 4, 4] to both sides of `middle`, which look to a point behind what it sees at `distance`."""
+    from .sampler import look_at
+
+    right, down, forward, eye = middle[:3].T
+    steps = np.linspace(-0.5, 0.5, views)
+    shifts = steps[:, None] * right - 0.15 * np.sin(2 * np.pi * steps)[:, None] * down
+    focus = eye + 1.5 * distance * forward
+    return np.stack([look_at(eye + PATH_LENGTH * distance * shift, focus) for shift in shifts])
+
+
+def _transforms(poses: np.ndarray, intrinsics: np.ndarray, width: int, height: int) -> dict[str, Any]:
+    """The content of transforms.json: intrinsics in pixels, camera-to-world with OpenGL axes."""
+    (fl_x, _, cx), (_, fl_y, cy) = (intrinsics[:2] * [[width], [height]]).tolist()
+    frames = [
+        {"file_path": f"images/{index:03}.png", "transform_matrix": (pose @ OPENGL_AXES).tolist()}
+        for index, pose in enumerate(poses)
+    ]
+    size = {"camera_model": "OPENCV", "w": width, "h": height}
+    return {**size, "fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy, "frames": frames}
+
+
+def _with_progress(poses: np.ndarray) -> Iterable[np.ndarray]:
+    """The poses, with a bar on stderr where that is a terminal."""
+    if not sys.stderr.isatty():
+        return poses
+    from rich.console import Console
+    from rich.progress import track
+
+    return track(poses, "Drawing", console=Console(stderr=True))
+
+
+if __name__ == "__main__":
+    main()

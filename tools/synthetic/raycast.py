@@ -1,0 +1,504 @@
+"""A compiled ray caster: exact z-depth and antialiased colour of scenes made of boxes, ellipsoids and cylinders.
+
+Rays keep z = 1 in the camera frame, so that the ray parameter is the z-depth. Every solid is the unit cube, ball or
+cylinder in a frame of its own (`halves` stretch it), which leaves three short intersection routines. Per tile of the
+image only the solids whose outline can touch it are tried, nearest first.
+"""
+
+import functools
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from .textures import LEVELS, SIZE
+
+BOX, ELLIPSOID, CYLINDER = 0, 1, 2  # the cylinder's axis is its local y
+TILE = 8  # pixels
+NEAR = 1e-3  # scene units: hits closer than this are the surface that the ray starts from
+LAMP_PLACES = 6  # of a lamp that shadows are worked out for
+CORNER_REACH, CORNER_SHADE = 0.35, 0.35  # how far, and how much, the corners of the room are darkened
+
+# NaN and infinity keep their meaning: a ray parallel to a face divides by zero. The loops allocate nothing, and without
+# numba's reference counting (`_nrt`), which else counts each array of the scene for each pixel, are 1.4 times as fast.
+_compiled = functools.partial(
+    numba.njit, cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"}, _nrt=False
+)
+_inlined = functools.partial(_compiled, forceinline=True)
+
+
+class Scene(NamedTuple):
+    """Solids, their materials and lights, in scene units; y points down. Solid 0 encloses all others and the cameras.
+
+    A material's texture coordinates are `uv @ (a, b, 1)` for the two local coordinates (a, b) of a face, in periods of
+    the texture; its colour is `colour @ (r, g, b, 1)` for a texel (r, g, b).
+    """
+
+    shapes: np.ndarray  # [solids] int64: BOX, ELLIPSOID or CYLINDER
+    centres: np.ndarray  # [solids, 3]
+    axes: np.ndarray  # [solids, 3, 3], rows: the local axes in the scene's frame
+    halves: np.ndarray  # [solids, 3], half extents along the local axes
+    materials: np.ndarray  # [solids, 6] int64, of the faces -x, +x, -y, +y, -z, +z
+    textures: np.ndarray  # [materials] int64, which texture of the bank
+    uv: np.ndarray  # [materials, 2, 3]
+    colours: np.ndarray  # [materials, 3, 4]
+    frequencies: np.ndarray  # [materials], periods of the texture per scene unit
+    glosses: np.ndarray  # [materials], strength of the highlight
+    glows: np.ndarray  # [materials], light that the surface gives off
+    light_positions: np.ndarray  # [lights, 3]
+    light_colours: np.ndarray  # [lights, 3]
+    light_reaches: np.ndarray  # [lights], distance at which half the light is left
+    light_lengths: np.ndarray  # [lights], half length of the lamp, a bar, which softens shadows; negative: casts none
+    ambient: np.ndarray  # [3]
+
+
+def render(
+    scene: Scene,
+    texels: np.ndarray,
+    camera_to_world: np.ndarray,
+    camera: tuple[float, float, float, float],
+    offsets: np.ndarray,
+    image: np.ndarray,
+    depth: np.ndarray,
+) -> None:
+    """Fill `depth` [H, W] with the z-depth at pixel centres and `image` [H, W, 3] with colour, from 0, 1 for white.
+
+    texels: `Textures.texels`. camera_to_world: [4, 4], OpenCV axes. camera: focal lengths and
+    centre in pixels, (fx, fy, cx, cy).
+    offsets: where inside a pixel to take colour, [samples, 2] in [0, 1); with none, `image` stays as it is.
+    """
+    count = len(scene.shapes)
+    origins, directions = np.empty((count, 3)), np.empty((count, 3, 3))
+    nearest, outlines = np.empty(count), np.empty((count, 4))
+    _see_solids(scene, camera_to_world, camera, origins, directions, nearest, outlines)
+    order, scratch = np.argsort(nearest), np.empty(count, np.int64)
+    _cast(
+        scene,
+        texels,
+        camera_to_world,
+        camera,
+        origins,
+        directions,
+        nearest,
+        outlines,
+        order,
+        scratch,
+        offsets,
+        image,
+        depth,
+    )
+
+
+@_compiled()
+def _see_solids(
+    scene: Scene,
+    camera_to_world: np.ndarray,
+    camera: tuple[float, float, float, float],
+    origins: np.ndarray,
+    directions: np.ndarray,
+    nearest: np.ndarray,
+    outlines: np.ndarray,
+) -> None:
+    """Fill what the rays need to know of each solid.
+
+    origins, directions: the camera's centre [solids, 3] and axes [solids, 3, 3] in the frames of the unit solids.
+    nearest: the smallest z-depth that it can have, [solids]. outlines: its box (x0, y0, x1, y1) in pixels, [solids, 4].
+    """
+    focal_x, focal_y, centre_x, centre_y = camera
+    for solid in range(len(scene.shapes)):
+        for i in range(3):
+            origins[solid, i] = 0.0
+            for k in range(3):
+                axis = scene.axes[solid, i, k] / scene.halves[solid, i]
+                origins[solid, i] += axis * (camera_to_world[k, 3] - scene.centres[solid, k])
+            for j in range(3):
+                directions[solid, i, j] = (
+                    _along(scene.axes, solid, i, camera_to_world[0, j], camera_to_world[1, j], camera_to_world[2, j])
+                    / scene.halves[solid, i]
+                )
+        least, x0, y0, x1, y1 = np.inf, np.inf, np.inf, -np.inf, -np.inf
+        for corner in range(8):
+            x, y, z = 0.0, 0.0, 0.0  # the corner in the camera's frame
+            for k in range(3):
+                place = scene.centres[solid, k] - camera_to_world[k, 3]
+                for i in range(3):
+                    side = 1.0 if (corner >> i) & 1 else -1.0
+                    place += side * scene.halves[solid, i] * scene.axes[solid, i, k]
+                x += camera_to_world[k, 0] * place
+                y += camera_to_world[k, 1] * place
+                z += camera_to_world[k, 2] * place
+            least = min(least, max(z, 0.0))
+            if z > NEAR:
+                u, v = focal_x * x / z + centre_x, focal_y * y / z + centre_y
+                x0, y0, x1, y1 = min(x0, u), min(y0, v), max(x1, u), max(y1, v)
+        if least <= NEAR and x0 < np.inf:  # partly behind the camera: may be anywhere
+            x0, y0, x1, y1 = -np.inf, -np.inf, np.inf, np.inf
+        nearest[solid] = least
+        outlines[solid, 0], outlines[solid, 1], outlines[solid, 2], outlines[solid, 3] = x0, y0, x1, y1
+
+
+@_compiled()
+def _cast(
+    scene: Scene,
+    texels: np.ndarray,
+    camera_to_world: np.ndarray,
+    camera: tuple[float, float, float, float],
+    origins: np.ndarray,
+    directions: np.ndarray,
+    nearest: np.ndarray,
+    outlines: np.ndarray,
+    order: np.ndarray,
+    solids: np.ndarray,
+    offsets: np.ndarray,
+    image: np.ndarray,
+    depth: np.ndarray,
+) -> None:
+    """`render`'s loop over tiles and pixels.
+
+    order: the solids by rising `nearest`. solids: room for those of a tile.
+    """
+    height, width = depth.shape
+    focal_x, focal_y, centre_x, centre_y = camera
+    for top in range(0, height, TILE):
+        for left in range(0, width, TILE):
+            tried = 0
+            for index in range(len(order)):
+                solid = order[index]
+                across = outlines[solid, 0] < left + TILE and outlines[solid, 2] > left
+                if across and outlines[solid, 1] < top + TILE and outlines[solid, 3] > top:
+                    solids[tried] = solid
+                    tried += 1
+            for row in range(top, min(top + TILE, height)):
+                for column in range(left, min(left + TILE, width)):
+                    x, y = (column + 0.5 - centre_x) / focal_x, (row + 0.5 - centre_y) / focal_y
+                    _, z = _first_hit(scene.shapes, origins, directions, nearest, solids, tried, x, y)
+                    depth[row, column] = z
+                    if len(offsets) > 0:
+                        pixel = (column - centre_x, row - centre_y, focal_x, focal_y)
+                        red, green, blue = _pixel_colour(
+                            scene, texels, camera_to_world, origins, directions, nearest, solids, tried, offsets, pixel
+                        )
+                        image[row, column, 0], image[row, column, 1], image[row, column, 2] = red, green, blue
+
+
+@_inlined()
+def _pixel_colour(
+    scene: Scene,
+    texels: np.ndarray,
+    camera_to_world: np.ndarray,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    nearest: np.ndarray,
+    solids: np.ndarray,
+    tried: int,
+    offsets: np.ndarray,
+    pixel: tuple[float, float, float, float],
+) -> tuple[float, float, float]:
+    """The mean colour of a pixel's samples; `pixel`: its corner from the image's centre, and the focal lengths.
+
+    Every sample looks up the texture; light is worked out anew only where a sample meets another face than the last.
+    """
+    samples = len(offsets)
+    red, green, blue = 0.0, 0.0, 0.0
+    fine = np.log2(pixel[2] * np.sqrt(samples))  # the spread is that of a ray of width 1
+    lit_solid, lit_face = -1, -1
+    light_r, light_g, light_b, shine, spread, material = 0.0, 0.0, 0.0, 0.0, 0.0, 0
+    for sample in range(samples):
+        x, y = (pixel[0] + offsets[sample, 0]) / pixel[2], (pixel[1] + offsets[sample, 1]) / pixel[3]
+        solid, z = _first_hit(scene.shapes, origins, directions, nearest, solids, tried, x, y)
+        ux = origins[solid, 0] + z * (
+            directions[solid, 0, 0] * x + directions[solid, 0, 1] * y + directions[solid, 0, 2]
+        )
+        uy = origins[solid, 1] + z * (
+            directions[solid, 1, 0] * x + directions[solid, 1, 1] * y + directions[solid, 1, 2]
+        )
+        uz = origins[solid, 2] + z * (
+            directions[solid, 2, 0] * x + directions[solid, 2, 1] * y + directions[solid, 2, 2]
+        )
+        face, normal_x, normal_y, normal_z = _face(scene, solid, ux, uy, uz)
+        if solid != lit_solid or face != lit_face:
+            lit_solid, lit_face, material = solid, face, scene.materials[solid, face]
+            light_r, light_g, light_b, shine, spread = _light(
+                scene, camera_to_world, solid, face, (x, y, z), (ux, uy, uz), (normal_x, normal_y, normal_z)
+            )
+        r, g, b = _texel(scene, texels, solid, face, material, ux, uy, uz, spread - fine + (sample + 0.5) / samples)
+        red, green, blue = red + r * light_r + shine, green + g * light_g + shine, blue + b * light_b + shine
+    return red / samples, green / samples, blue / samples
+
+
+@_inlined()
+def _first_hit(
+    shapes: np.ndarray,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    nearest: np.ndarray,
+    solids: np.ndarray,
+    tried: int,
+    x: float,
+    y: float,
+) -> tuple[int, float]:
+    """Which of the first `tried` of `solids` the ray (x, y, 1) of the camera meets first, and at what z-depth.
+
+    `solids` come by rising `nearest`.
+    """
+    best, best_z = 0, np.inf
+    for index in range(tried):
+        solid = solids[index]
+        if nearest[solid] > best_z:
+            break
+        dx = directions[solid, 0, 0] * x + directions[solid, 0, 1] * y + directions[solid, 0, 2]
+        dy = directions[solid, 1, 0] * x + directions[solid, 1, 1] * y + directions[solid, 1, 2]
+        dz = directions[solid, 2, 0] * x + directions[solid, 2, 1] * y + directions[solid, 2, 2]
+        z = _unit_hit(shapes[solid], origins[solid, 0], origins[solid, 1], origins[solid, 2], dx, dy, dz)
+        if z < best_z:
+            best, best_z = solid, z
+    return best, best_z
+
+
+@_inlined()
+def _unit_hit(shape: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float) -> float:
+    """Where along o + t d the unit solid is met first, from outside or from inside; infinity where it is missed."""
+    if shape == ELLIPSOID:
+        enter, leave = _quadratic(
+            dx * dx + dy * dy + dz * dz, ox * dx + oy * dy + oz * dz, ox * ox + oy * oy + oz * oz - 1.0
+        )
+    else:
+        enter, leave = _slab(oy, dy)
+        if shape == BOX:
+            enter_x, leave_x = _slab(ox, dx)
+            enter_z, leave_z = _slab(oz, dz)
+            enter, leave = max(enter, enter_x, enter_z), min(leave, leave_x, leave_z)
+        else:
+            enter_r, leave_r = _quadratic(dx * dx + dz * dz, ox * dx + oz * dz, ox * ox + oz * oz - 1.0)
+            enter, leave = max(enter, enter_r), min(leave, leave_r)
+    if not (enter <= leave and leave > NEAR):
+        return np.inf
+    return enter if enter > NEAR else leave
+
+
+@_inlined()
+def _slab(origin: float, direction: float) -> tuple[float, float]:
+    """The part of a line between the planes -1 and 1 of one axis."""
+    inverse = 1.0 / direction
+    a, b = (-1.0 - origin) * inverse, (1.0 - origin) * inverse
+    return min(a, b), max(a, b)
+
+
+@_inlined()
+def _quadratic(a: float, b: float, c: float) -> tuple[float, float]:
+    """The roots of a t^2 + 2 b t + c; an empty interval where there are none."""
+    discriminant = b * b - a * c
+    if discriminant < 0.0:
+        return np.inf, -np.inf
+    root = np.sqrt(discriminant)
+    return (-b - root) / a, (-b + root) / a
+
+
+@_inlined()
+def _face(scene: Scene, solid: int, ux: float, uy: float, uz: float) -> tuple[int, float, float, float]:
+    """The face (see `Scene.materials`) of a surface point in the unit frame, and the normal's direction there.
+
+    The normal is local and not of unit length.
+    """
+    shape = scene.shapes[solid]
+    nx, ny, nz = ux / scene.halves[solid, 0], uy / scene.halves[solid, 1], uz / scene.halves[solid, 2]
+    if shape == BOX:
+        nx, ny, nz = ux, uy, uz
+    elif shape == CYLINDER:
+        nx, ny, nz = (0.0, uy, 0.0) if uy * uy > 1.0 - 1e-9 else (nx, 0.0, nz)
+    ax, ay, az = abs(nx), abs(ny), abs(nz)
+    axis = 0 if ax >= ay and ax >= az else (1 if ay >= az else 2)
+    along = nx if axis == 0 else (ny if axis == 1 else nz)
+    if shape == BOX:
+        nx, ny, nz = along if axis == 0 else 0.0, along if axis == 1 else 0.0, along if axis == 2 else 0.0
+    return 2 * axis + (1 if along > 0.0 else 0), nx, ny, nz
+
+
+@_inlined()
+def _light(
+    scene: Scene,
+    camera_to_world: np.ndarray,
+    solid: int,
+    face: int,
+    ray: tuple[float, float, float],
+    unit_point: tuple[float, float, float],
+    normal: tuple[float, float, float],
+) -> tuple[float, float, float, float, float]:
+    """The light that falls on a surface point, its highlight, and log2 of the texels that a ray of width 1 covers.
+
+    ray: (x, y) and the z-depth at which it meets the point. unit_point: the point in the solid's unit frame.
+    """
+    x, y, z = ray
+    c, axes = camera_to_world, scene.axes
+    rx = c[0, 0] * x + c[0, 1] * y + c[0, 2]
+    ry = c[1, 0] * x + c[1, 1] * y + c[1, 2]
+    rz = c[2, 0] * x + c[2, 1] * y + c[2, 2]
+    px, py, pz = c[0, 3] + z * rx, c[1, 3] + z * ry, c[2, 3] + z * rz
+    length = np.sqrt(rx * rx + ry * ry + rz * rz)
+    rx, ry, rz = rx / length, ry / length, rz / length
+    nx = axes[solid, 0, 0] * normal[0] + axes[solid, 1, 0] * normal[1] + axes[solid, 2, 0] * normal[2]
+    ny = axes[solid, 0, 1] * normal[0] + axes[solid, 1, 1] * normal[1] + axes[solid, 2, 1] * normal[2]
+    nz = axes[solid, 0, 2] * normal[0] + axes[solid, 1, 2] * normal[1] + axes[solid, 2, 2] * normal[2]
+    slope = nx * rx + ny * ry + nz * rz
+    norm = np.sqrt(nx * nx + ny * ny + nz * nz) * (-1.0 if slope > 0.0 else 1.0)  # towards the camera
+    nx, ny, nz, slope = nx / norm, ny / norm, nz / norm, slope / norm
+
+    material = scene.materials[solid, face]
+    spread = np.log2(SIZE * scene.frequencies[material] * z * length / np.sqrt(max(-slope, 0.02)))
+    dim = _corner_shade(scene, unit_point, face) if solid == 0 else 1.0
+    glow = scene.glows[material]
+    light_r, light_g, light_b = scene.ambient[0], scene.ambient[1], scene.ambient[2]
+    shine = 0.0
+    for light in range(len(scene.light_lengths)):
+        vx = scene.light_positions[light, 0] - px
+        vy = scene.light_positions[light, 1] - py
+        vz = scene.light_positions[light, 2] - pz
+        distance = np.sqrt(vx * vx + vy * vy + vz * vz)
+        cosine = (nx * vx + ny * vy + nz * vz) / distance
+        if cosine <= 0.0:
+            continue
+        relative = distance / scene.light_reaches[light]
+        strength = 1.0 / (1.0 + relative * relative)
+        if scene.light_lengths[light] >= 0.0:
+            strength *= _visible_share(scene, light, px, py, pz, nx, ny, nz)
+        light_r += strength * cosine * scene.light_colours[light, 0]
+        light_g += strength * cosine * scene.light_colours[light, 1]
+        light_b += strength * cosine * scene.light_colours[light, 2]
+        if scene.glosses[material] > 0.0:  # the mirrored ray towards the light
+            mirrored = ((rx - 2 * slope * nx) * vx + (ry - 2 * slope * ny) * vy + (rz - 2 * slope * nz) * vz) / distance
+            shine += strength * scene.glosses[material] * max(mirrored, 0.0) ** 24
+    return glow + dim * light_r, glow + dim * light_g, glow + dim * light_b, shine, spread
+
+
+@_inlined()
+def _texel(
+    scene: Scene,
+    texels: np.ndarray,
+    solid: int,
+    face: int,
+    material: int,
+    ux: float,
+    uy: float,
+    uz: float,
+    detail: float,
+) -> tuple[float, float, float]:
+    """The material's colour at a point of the unit frame, interpolated in the level next below `detail`."""
+    lx, ly, lz = ux * scene.halves[solid, 0], uy * scene.halves[solid, 1], uz * scene.halves[solid, 2]
+    a, b = (lz, ly) if face < 2 else ((lx, lz) if face < 4 else (lx, ly))
+    u = scene.uv[material, 0, 0] * a + scene.uv[material, 0, 1] * b + scene.uv[material, 0, 2]
+    v = scene.uv[material, 1, 0] * a + scene.uv[material, 1, 1] * b + scene.uv[material, 1, 2]
+    level = min(max(int(detail), 0), LEVELS - 1)
+    size, start = SIZE, 0
+    for _ in range(level):
+        start += size * size
+        size //= 2
+    u, v = u * size - 0.5, v * size - 0.5
+    column, row = int(np.floor(u)), int(np.floor(v))
+    fu, fv = u - column, v - row
+    x0, x1 = column & (size - 1), (column + 1) & (size - 1)
+    y0, y1 = start + (row & (size - 1)) * size, start + ((row + 1) & (size - 1)) * size
+    bank = scene.textures[material]
+    w00, w01, w10, w11 = (1 - fu) * (1 - fv), fu * (1 - fv), (1 - fu) * fv, fu * fv
+    i00, i01, i10, i11 = y0 + x0, y0 + x1, y1 + x0, y1 + x1
+    red = (
+        w00 * texels[bank, i00, 0]
+        + w01 * texels[bank, i01, 0]
+        + w10 * texels[bank, i10, 0]
+        + w11 * texels[bank, i11, 0]
+    )
+    green = (
+        w00 * texels[bank, i00, 1]
+        + w01 * texels[bank, i01, 1]
+        + w10 * texels[bank, i10, 1]
+        + w11 * texels[bank, i11, 1]
+    )
+    blue = (
+        w00 * texels[bank, i00, 2]
+        + w01 * texels[bank, i01, 2]
+        + w10 * texels[bank, i10, 2]
+        + w11 * texels[bank, i11, 2]
+    )
+    red, green, blue = red / 255, green / 255, blue / 255
+    return (
+        max(
+            scene.colours[material, 0, 0] * red
+            + scene.colours[material, 0, 1] * green
+            + scene.colours[material, 0, 2] * blue
+            + scene.colours[material, 0, 3],
+            0.0,
+        ),
+        max(
+            scene.colours[material, 1, 0] * red
+            + scene.colours[material, 1, 1] * green
+            + scene.colours[material, 1, 2] * blue
+            + scene.colours[material, 1, 3],
+            0.0,
+        ),
+        max(
+            scene.colours[material, 2, 0] * red
+            + scene.colours[material, 2, 1] * green
+            + scene.colours[material, 2, 2] * blue
+            + scene.colours[material, 2, 3],
+            0.0,
+        ),
+    )
+
+
+@_inlined()
+def _corner_shade(scene: Scene, unit_point: tuple[float, float, float], face: int) -> float:
+    """How much light reaches a point of the enclosing solid: less where two of its faces meet."""
+    gap_x = np.inf if face < 2 else scene.halves[0, 0] * (1 - abs(unit_point[0]))
+    gap_y = np.inf if 2 <= face < 4 else scene.halves[0, 1] * (1 - abs(unit_point[1]))
+    gap_z = np.inf if face >= 4 else scene.halves[0, 2] * (1 - abs(unit_point[2]))
+    return 1.0 - CORNER_SHADE * np.exp(-min(gap_x, gap_y, gap_z) / CORNER_REACH)
+
+
+@_inlined()
+def _visible_share(scene: Scene, light: int, px: float, py: float, pz: float, nx: float, ny: float, nz: float) -> float:
+    """The share of a lamp that a surface point sees; where the lamp's two ends agree, what lies between isn't tried."""
+    ox, oy, oz = px + 2 * NEAR * nx, py + 2 * NEAR * ny, pz + 2 * NEAR * nz
+    visible = 0.0
+    for turn in range(LAMP_PLACES):
+        place = turn - 1 if turn > 1 else turn * (LAMP_PLACES - 1)  # the ends first
+        shift = scene.light_lengths[light] * (2 * place / (LAMP_PLACES - 1) - 1)
+        dx = scene.light_positions[light, 0] + 0.7 * shift - ox
+        dy = scene.light_positions[light, 1] - oy
+        dz = scene.light_positions[light, 2] + 0.7 * shift - oz
+        if not _blocked(scene, ox, oy, oz, dx, dy, dz):
+            visible += 1.0
+        if turn == 1 and visible != 1.0:
+            return visible / 2
+    return visible / LAMP_PLACES
+
+
+@_inlined()
+def _blocked(scene: Scene, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float) -> bool:
+    """Whether a solid, other than the enclosing one and those that glow, stands between o and o + d."""
+    squared = dx * dx + dy * dy + dz * dz
+    for solid in range(1, len(scene.shapes)):
+        # The ball around the solid, against the line.
+        wx, wy, wz = scene.centres[solid, 0] - ox, scene.centres[solid, 1] - oy, scene.centres[solid, 2] - oz
+        along = (wx * dx + wy * dy + wz * dz) / squared
+        off_x, off_y, off_z = wx - along * dx, wy - along * dy, wz - along * dz
+        half_x, half_y, half_z = scene.halves[solid, 0], scene.halves[solid, 1], scene.halves[solid, 2]
+        ball = half_x * half_x + half_y * half_y + half_z * half_z
+        if off_x * off_x + off_y * off_y + off_z * off_z > ball:
+            continue
+        t = _unit_hit(
+            scene.shapes[solid],
+            -_along(scene.axes, solid, 0, wx, wy, wz) / half_x,
+            -_along(scene.axes, solid, 1, wx, wy, wz) / half_y,
+            -_along(scene.axes, solid, 2, wx, wy, wz) / half_z,
+            _along(scene.axes, solid, 0, dx, dy, dz) / half_x,
+            _along(scene.axes, solid, 1, dx, dy, dz) / half_y,
+            _along(scene.axes, solid, 2, dx, dy, dz) / half_z,
+        )
+        if t < 1.0 and scene.glows[scene.materials[solid, 0]] == 0.0:
+            return True
+    return False
+
+
+@_inlined()
+def _along(axes: np.ndarray, solid: int, axis: int, x: float, y: float, z: float) -> float:
+    """The component of a vector along one of a solid's axes."""
+    return axes[solid, axis, 0] * x + axes[solid, axis, 1] * y + axes[solid, axis, 2] * z

@@ -1,0 +1,127 @@
+"""Data-parallel training: processes that each have a share of a step's scenes, and average their gradients."""
+
+import multiprocessing
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.distributed as dist
+from torch import nn
+
+from ...runtime.errors import InputError
+from ...runtime.system.files import scratch_folder
+from ..processes import safe_path
+
+# Gloo finds its address by the host's name, which need not resolve; all processes are on this machine.
+INTERFACE_VARIABLE = "GLOO_SOCKET_IFNAME"
+LOOPBACK = {"linux": "lo", "darwin": "lo0"}
+
+
+class Team:
+    """The processes of a run; rank 0 logs, validates and saves. A team of one does nothing."""
+
+    def __init__(self, rank: int = 0, size: int = 1) -> None:
+        self.rank, self.size = rank, size
+
+    @property
+    def leads(self) -> bool:
+        """Whether this is rank 0."""
+        return self.rank == 0
+
+    def share(self, batch: int) -> range:
+        """The places in a batch whose scenes are this process's."""
+        return range(self.rank, batch, self.size)
+
+    def sum_gradients(self, parameters: Iterable[nn.Parameter]) -> None:
+        """Replace every gradient by its sum over all processes; raises InputError if one of them has ended.
+
+        A parameter that no process has a gradient for keeps none.
+        """
+        if self.size == 1:
+            return
+        trained = [p for p in parameters if p.requires_grad]
+        found = torch.tensor([float(p.grad is not None) for p in trained])
+        parts = [torch.zeros_like(p).flatten() if p.grad is None else p.grad.flatten() for p in trained]
+        flat = torch.cat([found, *parts])
+        with _peers():
+            dist.all_reduce(flat)
+        found, *parts = flat.split([len(trained), *(p.numel() for p in trained)])
+        for p, count, part in zip(trained, found.tolist(), parts, strict=True):
+            p.grad = part.view_as(p) if count else None
+
+    def gather(self, entries: list[dict[str, float]]) -> list[dict[str, float]]:
+        """The entries of all processes, by rank."""
+        if self.size == 1:
+            return entries
+        gathered: list[Any] = [None] * self.size
+        with _peers():
+            dist.all_gather_object(gathered, entries)
+        return [entry for part in gathered for entry in part]
+
+
+@contextmanager
+def other_processes(size: int, work: Callable[..., None], *arguments: Any) -> Iterator[None]:
+    """Start the other processes of a team of `size`, of which this one is rank 0; each runs `work(team, *arguments)`.
+
+    work: a function of a module, since the processes are new ones. They end with this process, however it ends.
+    """
+    if size == 1:
+        yield
+        return
+    context = multiprocessing.get_context("spawn")
+    with scratch_folder() as folder:
+        store = folder / "store"
+        others = [
+            context.Process(target=_run, args=(rank, size, store, work, arguments), daemon=True)
+            for rank in range(1, size)
+        ]
+        with safe_path():
+            for process in others:
+                process.start()
+        _join(0, size, store)
+        try:
+            yield
+        finally:
+            dist.destroy_process_group()
+            for process in others:
+                process.terminate()
+                process.join()
+
+
+def _run(rank: int, size: int, store: Path, work: Callable[..., None], arguments: tuple[Any, ...]) -> None:
+    """What a process other than rank 0 does. Where rank 0 ends, the next exchange fails, and so ends this one."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; rank 0 decides
+    _join(rank, size, store)
+    try:
+        work(Team(rank, size), *arguments)
+    except InputError:
+        os._exit(1)
+
+
+def _join(rank: int, size: int, store: Path) -> None:
+    if sys.platform in LOOPBACK:
+        os.environ.setdefault(INTERFACE_VARIABLE, LOOPBACK[sys.platform])
+    dist.init_process_group("gloo", store=dist.FileStore(str(store), size), rank=rank, world_size=size)
+
+
+@contextmanager
+def _peers() -> Iterator[None]:
+    """Turn what gloo raises when a process has ended into one line."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise InputError(
+            f"a training process ended ({str(error).splitlines()[0]}); repeat the command to resume"
+        ) from None
+
+
+def mean_entries(entries: list[dict[str, float]]) -> dict[str, float]:
+    """The mean of each value over the entries that have it."""
+    names = dict.fromkeys(name for entry in entries for name in entry)
+    found = {name: [entry[name] for entry in entries if name in entry] for name in names}
+    return {name: sum(values) / len(values) for name, values in found.items()}

@@ -1,0 +1,42 @@
+"""Make a trained checkpoint the model that is carried along.
+
+    python -P -m idesplat.tools.training.release runs/tiny/last.ckpt
+
+Exports it, verified, to `runtime/default/`, and writes its checksum beside it.
+"""
+
+import hashlib
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ...export.cli import export
+from ...runtime.cli.terminal import run
+from ...runtime.errors import exit_on_input_error
+from ...runtime.inference.bundled_model import CHECKSUM_SUFFIX, FOLDER, NAME
+from ...runtime.system.files import make_folder, replacing
+
+PRESET = "idesplat-tiny"
+
+
+@exit_on_input_error
+def carry(
+    checkpoint: Annotated[Path, typer.Argument(help="What idesplat-train wrote.", show_default=False)],
+    preset: Annotated[str, typer.Option(help="The network.")] = PRESET,
+) -> None:
+    """Export a checkpoint as the carried model."""
+    path = make_folder(FOLDER) / NAME
+    export(checkpoint, path, preset=preset)
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    with replacing(path.with_name(NAME + CHECKSUM_SUFFIX)) as temporary:
+        temporary.write_text(f"{digest}  {NAME}\n")
+
+
+def main() -> None:
+    """Run the command."""
+    run(carry)
+
+
+if __name__ == "__main__":
+    main()
