@@ -18,8 +18,8 @@ from ..runtime.system.files import check_writable, make_folder
 
 if TYPE_CHECKING:
     from ..model.registry import Network
-    from .freeze import Fixed, Graphs
     from .stages import Stage
+    from .tracing import Graphs, StaticShape
 
 MISMATCH = 1
 # More views, or pixels in all of them, are not baked in: tracing runs the network in PyTorch once, and IDESplat takes
@@ -58,8 +58,8 @@ def export(
     if find_spec("torch") is None or find_spec("onnx") is None:
         raise InputError("exporting needs PyTorch and onnx, which are not installed; pip install 'idesplat[export]'")
     from ..model.checkpoint import CheckpointError
-    from .freeze import Fixed
-    from .precision.parts import PRECISIONS
+    from .precision.convert import PRECISIONS
+    from .tracing import StaticShape
 
     if precision not in PRECISIONS:
         raise InputError(f"--precision {precision}: unknown; choose one of {', '.join(PRECISIONS)}")
@@ -69,10 +69,10 @@ def export(
         model, name, digest = _load(checkpoint, preset)
     except CheckpointError as error:
         raise InputError(str(error)) from None
-    fixed = Fixed(views, _fitting_size(size, views, model.config.size_multiple) if size else None)
-    description = describe(model, name, checkpoint.name, digest, fixed, precision)
+    static = StaticShape(views, _fitting_size(size, views, model.config.size_multiple) if size else None)
+    description = describe(model, name, checkpoint.name, digest, static, precision)
     with _naming_what_fails("choose a folder on a disk with room for it"):
-        passed = _export(model, description, fixed, out, staged, verbose)
+        passed = _export(model, description, static, out, staged, verbose)
     if not passed:
         warn("error: the graph departs from the network (see the table); nothing was written")
         raise SystemExit(MISMATCH)
@@ -115,7 +115,7 @@ def _check_targets(out: Path | None, staged: Path | None) -> None:
 
 def _check_existing(out: Path | None, staged: Path | None) -> None:
     """Raise InputError if the results would replace anything that idesplat-export did not write."""
-    from .written import check_replaceable, is_our_graph
+    from .existing_exports import check_replaceable, is_our_graph
 
     if out is not None:
         outputs().writes("", [out], known=is_our_graph(out))
@@ -161,20 +161,20 @@ def _load(checkpoint: Path, preset: str | None) -> "tuple[Network, str, str]":
 
 
 def describe(
-    model: "Network", preset: str, checkpoint: str, digest: str, fixed: "Fixed", precision: str = "float32"
+    model: "Network", preset: str, checkpoint: str, digest: str, static: "StaticShape", precision: str = "float32"
 ) -> Description:
     """What an exported network says of itself."""
     from ..model.depthsplat.network import DepthSplatDepth
 
     config = model.config
-    height, width = fixed.size or (config.height, config.width)
+    height, width = static.size or (config.height, config.width)
     return Description(
         preset=preset,
         height=height,
         width=width,
         size_multiple=config.size_multiple,
-        fixed_size=fixed.size is not None,
-        fixed_views=fixed.views or 0,
+        fixed_size=static.size is not None,
+        fixed_views=static.views or 0,
         near=config.near,
         far=config.far,
         trained_views=list(config.trained_views),
@@ -189,7 +189,12 @@ def describe(
 
 
 def _export(
-    model: "Network", description: Description, fixed: "Fixed", out: Path | None, staged: Path | None, verbose: bool
+    model: "Network",
+    description: Description,
+    static: "StaticShape",
+    out: Path | None,
+    staged: Path | None,
+    verbose: bool,
 ) -> bool:
     """Trace, verify and write; False and nothing written if the graph departs from the network.
 
@@ -198,12 +203,12 @@ def _export(
     """
     from rich.console import Console
 
-    from .freeze import OPSET, freeze
-    from .graph.external_data import check_weights, hand_out, publish
+    from .existing_exports import replace_folder, working_folder
+    from .graph.external_data import check_weights, publish, save_model
     from .stages import NamedTensors
+    from .tracing import OPSET, export_graphs
     from .validation.compare import Exported, verify
     from .validation.report import print_details, print_summary
-    from .written import replace_folder, working_folder
 
     console = Console(stderr=True)
     network = NamedTensors(model)
@@ -212,15 +217,15 @@ def _export(
         folders = {parent: stack.enter_context(working_folder(parent)) for parent in parents}
         working = next(iter(folders.values()))
         with console.status("tracing the network (a minute or so)"):
-            graphs = freeze(network, description, fixed, make_folder(working / "graphs"))
+            graphs = export_graphs(network, description, static, make_folder(working / "graphs"))
         say(f"traced: {graphs.nodes} nodes, opset {OPSET}, {graphs.bytes / 1e6:.0f} MB")
-        fused = hand_out(graphs.whole, make_folder(folders[out.parent] / "fused") / out.name) if out else []
+        fused = save_model(graphs.whole, make_folder(folders[out.parent] / "fused") / out.name) if out else []
         new = make_folder(folders[staged.parent] / "staged") if staged else None
         stages = _write_stages(graphs, new) if new else [(stage, graphs.of_stage(stage)) for stage in graphs.stages]
         errors = []
         with console.status("verifying against PyTorch") as status:
             exported = Exported(stages, staged is not None, fused[0] if fused else None)
-            for error in verify(network, exported, description, fixed):
+            for error in verify(network, exported, description, static):
                 errors.append(error)
                 status.update(f"verifying against PyTorch: {error.stage}, {error.case}")
         (print_details if verbose else print_summary)(errors)
@@ -240,13 +245,13 @@ def _export(
 
 def _write_stages(graphs: "Graphs", folder: Path) -> "list[tuple[Stage, Path]]":
     """Write one graph a stage and the manifest into an empty folder; the stages, each with its graph."""
-    from .graph.external_data import hand_out
+    from .graph.external_data import save_model
 
     files = [
         StageFile(stage.name, f"{stage.name}.onnx", list(stage.inputs), list(stage.outputs)) for stage in graphs.stages
     ]
     for stage, file in zip(graphs.stages, files, strict=True):
-        hand_out(graphs.of_stage(stage), folder / file.file)
+        save_model(graphs.of_stage(stage), folder / file.file)
     write_manifest(folder, files)
     return [(stage, folder / file.file) for stage, file in zip(graphs.stages, files, strict=True)]
 

@@ -11,11 +11,11 @@ import onnx
 import torch
 from torch import Tensor, nn
 
-from ..model.depthsplat.depth_stage import PredictedDepth
-from ..model.idesplat.gaussian_head import Predicted
+from ..model.depthsplat.depth_stage import DepthOutput
+from ..model.idesplat.gaussian_head import ModelOutput
 from ..model.registry import Network
 from ..runtime.inference.metadata import INPUTS
-from .graph.nodes import names_read, nodes_between
+from .graph.subgraph import extract_subgraph, names_read
 
 
 @dataclass(frozen=True)
@@ -44,9 +44,9 @@ class NamedTensors(nn.Module):
         named: dict[str, Tensor] = {}
         parts: tuple[Any, ...] = self.model.stages(*inputs)
         for stage, part in zip(self.stages, parts, strict=True):
-            if isinstance(part, Predicted):
+            if isinstance(part, ModelOutput):
                 named |= {"depth": part.depth, **part.gaussians._asdict()}
-            elif isinstance(part, PredictedDepth):
+            elif isinstance(part, DepthOutput):
                 named |= {"depth": part.depth}
             else:
                 named |= {f"{stage}.{field}": value for field, value in part._asdict().items()}
@@ -62,7 +62,7 @@ def find_stages(traced: onnx.ModelProto, names: list[str]) -> list[Stage]:
         own = results if stage == names[-1] else [name for name in named if name.startswith(f"{stage}.")]
         outputs = [name for name in own if name in needed]
         borders = {*INPUTS, *named} - set(own)
-        read = nodes_between(traced, borders, outputs)[1]
+        read = extract_subgraph(traced, borders, outputs)[1]
         stages.append(Stage(stage, tuple(name for name in (*INPUTS, *named) if name in read), tuple(outputs)))
         needed |= read
     return stages[::-1]
@@ -70,7 +70,7 @@ def find_stages(traced: onnx.ModelProto, names: list[str]) -> list[Stage]:
 
 def stage_graph(traced: onnx.ModelProto, stage: Stage) -> onnx.ModelProto:
     """The part of a traced graph that a stage is, as a graph of its own."""
-    nodes, _ = nodes_between(traced, set(stage.inputs), stage.outputs)
+    nodes, _ = extract_subgraph(traced, set(stage.inputs), stage.outputs)
     read = {name for node in nodes for name in names_read(node)} | set(stage.outputs)
     values = {value.name: value for value in (*traced.graph.input, *traced.graph.output)}
     inputs, outputs = ([values[name] for name in names] for names in (stage.inputs, stage.outputs))

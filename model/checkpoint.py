@@ -329,6 +329,9 @@ def _counted_down(name: str) -> Callable[[re.Match[str]], str]:
 
 Replacement = str | Callable[[re.Match[str]], str]
 _RULES: list[tuple[str, Replacement]] = [
+    # this project's own names before version 2
+    (r"\.grow(_|\d\.)", r".upsample\1"),
+    (r"\.shrink2\.", ".downsample."),
     # stages
     (r"^depth_predictor\.(backbone|transformer)\.", r"encoder.\1."),
     (r"^depth_predictor\.depth_anything\.pretrained\.", "encoder.vit."),
@@ -336,11 +339,11 @@ _RULES: list[tuple[str, Replacement]] = [
     (r"^depth_predictor\.conv_mv\.", "dpbu1.merge.conv."),
     (r"^depth_predictor\.conv_mv_u2\.", "dpbu2.merge.conv."),
     (r"^depth_predictor\.conv_mv_u4\.", "dpbu3.merge.conv."),
-    (r"^depth_predictor\.cvo_pyramid_u2\.stages\.0\.", "dpbu2.grow_features."),
-    (r"^depth_predictor\.mv_pyramid_u2\.stages\.0\.", "dpbu2.grow_context."),
-    (r"^depth_predictor\.cvo_pyramid_u4\.stages\.0\.", "dpbu3.grow_features."),
-    (r"^depth_predictor\.mv_pyramid_u4\.stages\.0\.", "dpbu3.grow_context."),
-    (r"^depth_predictor\.features_cnn_u2\.stages\.0\.", "dpbu3.grow_cnn."),
+    (r"^depth_predictor\.cvo_pyramid_u2\.stages\.0\.", "dpbu2.upsample_features."),
+    (r"^depth_predictor\.mv_pyramid_u2\.stages\.0\.", "dpbu2.upsample_context."),
+    (r"^depth_predictor\.cvo_pyramid_u4\.stages\.0\.", "dpbu3.upsample_features."),
+    (r"^depth_predictor\.mv_pyramid_u4\.stages\.0\.", "dpbu3.upsample_context."),
+    (r"^depth_predictor\.features_cnn_u2\.stages\.0\.", "dpbu3.upsample_cnn."),
     (r"^depth_predictor\.wiea_f(\d)_1\.", r"dpbu\1.first."),
     (r"^depth_predictor\.wiea_f(\d)_2\.", r"dpbu\1.second."),
     (r"^depth_predictor\.res_depth_head\.", "gaussians.residual."),
@@ -349,7 +352,7 @@ _RULES: list[tuple[str, Replacement]] = [
     (r"^depth_predictor\.gaussian_layers\.", "gaussians.focus.layers."),
     (r"^depth_predictor\.gaussian_conv\.", "gaussians.expand."),
     (r"^depth_predictor\.pretrained\.", "encoder.vit."),
-    (r"^depth_predictor\.(mv|mono)_pyramid\.stages\.1\.", r"depth2.grow_\1."),
+    (r"^depth_predictor\.(mv|mono)_pyramid\.stages\.1\.", r"depth2.upsample_\1."),
     (r"^depth_predictor\.regressor\.(\d)\.", lambda match: f"{_depth_stage(match)}.regulariser."),
     (r"^depth_predictor\.regressor_residual\.(\d)\.", lambda match: f"{_depth_stage(match)}.shortcut."),
     (r"^depth_predictor\.depth_head\.(\d)\.0\.", lambda match: f"{_depth_stage(match)}.head1."),
@@ -371,9 +374,9 @@ _RULES: list[tuple[str, Replacement]] = [
     (r"\.patch_embed\.proj\.", ".patch_embed."),
     (r"\.ls([12])\.gamma$", r".scale\1"),
     (r"\.mlp\.fc([12])\.", r".fc\1."),
-    (r"\.resize_layers\.0\.", ".grow4."),
-    (r"\.resize_layers\.1\.", ".grow2."),
-    (r"\.resize_layers\.3\.", ".shrink2."),
+    (r"\.resize_layers\.0\.", ".upsample4."),
+    (r"\.resize_layers\.1\.", ".upsample2."),
+    (r"\.resize_layers\.3\.", ".downsample."),
     (r"scratch\.layer(\d)_rn\.", _counted_down("laterals")),
     (r"scratch\.refinenet(\d)\.", _counted_down("fusions")),
     (r"\.resConfUnit1\.", ".lateral."),

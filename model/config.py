@@ -17,7 +17,7 @@ class ViTConfig:
     # Patches per side that the position embedding was trained on (518 / 14).
     grid: int = 37
     # Blocks whose normalised output the DPT head reads.
-    taps: tuple[int, int, int, int] = (2, 5, 8, 11)
+    out_indices: tuple[int, int, int, int] = (2, 5, 8, 11)
 
 
 @dataclass(frozen=True)
@@ -220,7 +220,7 @@ TWO_SCALES = (
     DepthScaleConfig(candidates=32, unet=UNetConfig(channels=64, levels=4, heads=2)),
 )
 VIT_BASE = ViTConfig(dim=768, heads=12)
-VIT_LARGE = ViTConfig(dim=1024, depth=24, heads=16, taps=(4, 11, 17, 23))
+VIT_LARGE = ViTConfig(dim=1024, depth=24, heads=16, out_indices=(4, 11, 17, 23))
 UPSAMPLER_BASE = UpsamplerConfig(channels=(96, 192, 384, 768), depth_features=48, features=96)
 UPSAMPLER_LARGE = UpsamplerConfig(channels=(128, 256, 512, 1024), depth_features=64, features=128)
 
@@ -238,7 +238,7 @@ _TINY = IDESplatConfig(
     transformer_ffn_ratio=2,
     # Sixteen windows: at 256x256 they are 16 tokens a side, four times less work than with the releases' four.
     attention_splits=4,
-    vit=ViTConfig(dim=96, depth=4, heads=3, grid=18, taps=(0, 1, 2, 3)),
+    vit=ViTConfig(dim=96, depth=4, heads=3, grid=18, out_indices=(0, 1, 2, 3)),
     dpt=DPTConfig(features=32, channels=(24, 48, 96, 96), disparity_channels=16),
     dpbus=(
         DPBUConfig(channels=64, candidates=97, scale=1, unet=UNetConfig(channels=40, levels=3)),

@@ -22,7 +22,7 @@ SMALL = IDESplatConfig(
     backbone_channels=(16, 24, 32),
     feature_channels=32,
     transformer_layers=2,
-    vit=ViTConfig(dim=48, depth=4, heads=3, grid=5, taps=(0, 1, 2, 3)),
+    vit=ViTConfig(dim=48, depth=4, heads=3, grid=5, out_indices=(0, 1, 2, 3)),
     dpt=DPTConfig(features=16, channels=(12, 24, 32, 48), disparity_channels=8),
     dpbus=(
         DPBUConfig(channels=64, candidates=33, scale=1, unet=UNetConfig(channels=32, levels=3)),

@@ -25,7 +25,7 @@ ORDERS = {
         *("rendering", "viewer", "cli"),
     ),
     "model": ("config", "common", "idesplat", "depthsplat", "registry", "checkpoint"),
-    "export": ("written", "graph", "stages", "room", "precision", "freeze", "validation", "pipeline", "cli"),
+    "export": ("existing_exports", "graph", "stages", "room", "precision", "tracing", "validation", "pipeline", "cli"),
     "tools": ("processes", "synthetic", "training", "evaluation", "benchmark", "figures"),
 }
 

@@ -9,7 +9,7 @@ from onnx.external_data_helper import ExternalDataInfo
 from torch import Tensor
 
 from ...runtime.errors import InputError
-from ..written import is_our_graph, weights_beside
+from ..existing_exports import is_our_graph, weights_beside
 
 # Protobuf reads no message of 2 GiB or more, so a larger model keeps its weights beside it when it is handed out, too.
 LARGEST_FILE = 2_000_000_000
@@ -31,7 +31,7 @@ def fill_inputs(model: onnx.ModelProto, weights: Iterable[tuple[str, Tensor]], p
                 model.graph.input.remove(inputs[name])
 
 
-def hand_out(graph: Path, out: Path) -> list[Path]:
+def save_model(graph: Path, out: Path) -> list[Path]:
     """Write a graph whose weights lie beside it to a new file, which then holds them unless that makes it too large.
 
     Returns the paths written. What cannot stay together is `out` and a file that is to be moved along with it; that one
@@ -62,7 +62,7 @@ def hand_out(graph: Path, out: Path) -> list[Path]:
 
 
 def check_weights(graph: Path, written: Path) -> None:
-    """Raise InputError unless a graph that `hand_out` wrote holds the weights of the one that it was written from.
+    """Raise InputError unless a graph that `save_model` wrote holds the weights of the one that it was written from.
 
     Outputs alone would not show a damaged weight that has little effect on the cases of the verification.
     """
@@ -85,7 +85,7 @@ def _digest(tensor: onnx.TensorProto, folder: Path) -> bytes:
 
 
 def publish(files: list[Path], folder: Path) -> list[Path]:
-    """Move what `hand_out` wrote into a folder of the same file system, over a graph of the same name; their new paths.
+    """Move what `save_model` wrote into a folder of the same file system, over any graph of that name; their new paths.
 
     A run that is killed on the way leaves the old graph with its weights or the new one with its own: weights come
     first, under a name of their own, and those of the graph that was replaced go last.

@@ -16,7 +16,7 @@ import onnx.parser
 import torch
 from torch import Tensor, nn
 
-from ...model.common.gather_attention import SparseProducts, correlate, weigh
+from ...model.common.gather_attention import GatherAttention, gathered_dot, gathered_weighted_sum
 
 # With fewer numbers than this to gather for a pixel, the steps cost more than they save.
 FEW = 256
@@ -48,37 +48,39 @@ STEPS = """
             product = MatMul ({product})
         }}> (steps, go)
 """
-CORRELATE = """correlate <step> (queries, table, rows) => (scores) {{
+GATHERED_DOT = """gathered_dot <step> (queries, table, rows) => (scores) {{
         {steps}
         scores_shape = Concat <axis = 0> (all, pixels, candidates)
         scores_by_pixel = Reshape (products, scores_shape)
         scores = Transpose <perm = [0, 2, 1]> (scores_by_pixel)
     }}""".format(steps=STEPS.format(shape="channels, one", by_pixel="queries", product="gathered, some"))
-WEIGH = """weigh <step> (probability, table, rows) => (sums) {{
+GATHERED_WEIGHTED_SUM = """gathered_weighted_sum <step> (probability, table, rows) => (sums) {{
         weights = Transpose <perm = [0, 2, 1]> (probability)
         {steps}
         sums_shape = Concat <axis = 0> (all, pixels, channels)
         sums = Reshape (products, sums_shape)
     }}""".format(steps=STEPS.format(shape="one, candidates", by_pixel="weights", product="some, gathered"))
-FUNCTIONS = tuple(f'<domain: "{DOMAIN}", opset_import: ["": 20]> {text}' for text in (CORRELATE, WEIGH))
+FUNCTIONS = tuple(
+    f'<domain: "{DOMAIN}", opset_import: ["": 20]> {text}' for text in (GATHERED_DOT, GATHERED_WEIGHTED_SUM)
+)
 
 
 @contextmanager
-def in_steps(network: nn.Module) -> Iterator[None]:
-    """Have a network's sparse products traced as nodes that `explain` explains."""
-    parts = [part for part in network.modules() if isinstance(part, SparseProducts) and part.gathers >= FEW]
+def chunked(network: nn.Module) -> Iterator[None]:
+    """Have a network's sparse products traced as nodes that `lower_custom_ops` explains."""
+    parts = [part for part in network.modules() if isinstance(part, GatherAttention) and part.gathers >= FEW]
     for part in parts:
-        part.correlate = partial(_Correlate.apply, part.block)
-        part.weigh = partial(_Weigh.apply, part.block)
+        part.gathered_dot = partial(_GatheredDot.apply, part.block)
+        part.gathered_weighted_sum = partial(_GatheredWeightedSum.apply, part.block)
     try:
         yield
     finally:
         for part in parts:
-            part.correlate, part.weigh = correlate, weigh
+            part.gathered_dot, part.gathered_weighted_sum = gathered_dot, gathered_weighted_sum
 
 
-def explain(traced: onnx.ModelProto) -> onnx.ModelProto:
-    """The graph with standard operators in place of the nodes that `in_steps` left, and named after them."""
+def lower_custom_ops(traced: onnx.ModelProto) -> onnx.ModelProto:
+    """The graph with standard operators in place of the nodes that `chunked` left, and named after them."""
     products = {node.output[0]: node.name for node in traced.graph.node if node.domain == DOMAIN}
     traced.functions.extend(onnx.parser.parse_function(function) for function in FUNCTIONS)
     model = onnx.inliner.inline_local_functions(traced)
@@ -98,27 +100,27 @@ def _name(node: onnx.NodeProto, scope: str) -> None:
             _name(inner, node.name)
 
 
-class _Correlate(torch.autograd.Function):
-    """`correlate`, traced as one node."""
+class _GatheredDot(torch.autograd.Function):
+    """`gathered_dot`, traced as one node."""
 
     @staticmethod
     def forward(ctx: Any, step: int, queries: Tensor, table: Tensor, rows: Tensor) -> Tensor:
-        return correlate(queries, table, rows)
+        return gathered_dot(queries, table, rows)
 
     @staticmethod
     def symbolic(g: Any, step: int, queries: Any, table: Any, rows: Any) -> Any:
-        node = g.op(f"{DOMAIN}::correlate", queries, table, rows, step_i=[-1, step])
+        node = g.op(f"{DOMAIN}::gathered_dot", queries, table, rows, step_i=[-1, step])
         return node.setType(queries.type().with_sizes([None] * 3))
 
 
-class _Weigh(torch.autograd.Function):
-    """`weigh`, traced as one node."""
+class _GatheredWeightedSum(torch.autograd.Function):
+    """`gathered_weighted_sum`, traced as one node."""
 
     @staticmethod
     def forward(ctx: Any, step: int, probability: Tensor, table: Tensor, rows: Tensor) -> Tensor:
-        return weigh(probability, table, rows)
+        return gathered_weighted_sum(probability, table, rows)
 
     @staticmethod
     def symbolic(g: Any, step: int, probability: Any, table: Any, rows: Any) -> Any:
-        node = g.op(f"{DOMAIN}::weigh", probability, table, rows, step_i=[-1, step])
+        node = g.op(f"{DOMAIN}::gathered_weighted_sum", probability, table, rows, step_i=[-1, step])
         return node.setType(table.type().with_sizes([None] * 3))

@@ -6,7 +6,7 @@
 import numpy as np
 import onnx
 
-from ..graph.nodes import replace_nodes
+from ..graph.subgraph import replace_nodes
 
 
 def in_fp16(model: onnx.ModelProto, names: set[str]) -> onnx.ModelProto:

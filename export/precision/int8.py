@@ -11,7 +11,7 @@ import onnx
 from onnxruntime.quantization import QuantType, quantize_dynamic
 
 from ...runtime.inference.session import open_session, run_session
-from ..graph.nodes import names_read, replace_nodes
+from ..graph.subgraph import names_read, replace_nodes
 
 # Fewer products than this for an output are quicker in float32 than to quantise.
 FEW_TERMS = 64
@@ -91,8 +91,8 @@ class _Convolutions:
         self.weights = {tensor.name: tensor for tensor in model.graph.initializer}
         self.nodes: list[onnx.NodeProto] = []
         # Tensors rounded to the range of another: as integers, and as the numbers that these stand for.
-        self.integers: dict[tuple[str, str], str] = {}
-        self.numbers: dict[tuple[str, str], str] = {}
+        self.quantized: dict[tuple[str, str], str] = {}
+        self.dequantized: dict[tuple[str, str], str] = {}
         self.scales: dict[str, list[str]] = {}
 
     def rounded(self) -> onnx.ModelProto:
@@ -131,8 +131,8 @@ class _Convolutions:
         """Have a node move integers."""
         result = node.output[0]
         for index in range(len(node.input) if node.op_type == "Concat" else 1):
-            node.input[index] = self._integers(node.input[index], whose)
-        node.output[0] = self.integers[result, whose] = f"{result}.integers"
+            node.input[index] = self._quantized(node.input[index], whose)
+        node.output[0] = self.quantized[result, whose] = f"{result}.integers"
         self.nodes.append(node)
 
     def _convolution(self, node: onnx.NodeProto) -> None:
@@ -144,16 +144,16 @@ class _Convolutions:
         more_inputs = 0 if kernel[0].size % LANES == 0 else -inputs % LANES
         kernel = np.pad(kernel, [(0, more_outputs), (0, more_inputs), *[(0, 0)] * (kernel.ndim - 2)])
         bias = [np.pad(values, (0, more_outputs)) for values in bias]
-        read = self._widened(given, more_inputs, kernel.ndim) if more_inputs else given
-        node.input[0] = self._numbers(read, given)
+        read = self._pad_channels(given, more_inputs, kernel.ndim) if more_inputs else given
+        node.input[0] = self._dequantized(read, given)
         node.input[1:] = self._rounded_weights(node, [kernel, *bias], _step(self.ranges[given]))
         node.output[0] = f"{result}.exact"
         self.nodes.append(node)
         integers = self._quantize(node.output[0], result)
         if more_outputs:
-            integers = self._narrowed(integers, outputs)
-        self.integers[result, result] = integers
-        self.numbers[result, result] = self._dequantize(integers, result, result)
+            integers = self._slice_channels(integers, outputs)
+        self.quantized[result, result] = integers
+        self.dequantized[result, result] = self._dequantize(integers, result, result)
 
     def _rounded_weights(self, node: onnx.NodeProto, weights: list[np.ndarray], step: np.float32) -> list[str]:
         """The kernel and bias of a convolution whose input has this step, rounded."""
@@ -174,34 +174,34 @@ class _Convolutions:
             results.append(result)
         return results
 
-    def _widened(self, name: str, channels: int, axes: int) -> str:
+    def _pad_channels(self, name: str, channels: int, axes: int) -> str:
         """A tensor whose integers are those of another in its range, and so many channels of zeros."""
         wide = f"{name}.wide"
-        if (wide, name) not in self.integers:
+        if (wide, name) not in self.quantized:
             # Padding the one axis by its number is more than ONNX Runtime's optimiser bears.
             pads = np.zeros((2, axes), np.int64)
             pads[1, 1] = channels
-            given = [self._integers(name, name), self._constant(f"{wide}.pads", pads.ravel()), self._scale(name)[1]]
-            self.integers[wide, name] = self._add("Pad", given, f"{wide}.integers")
+            given = [self._quantized(name, name), self._constant(f"{wide}.pads", pads.ravel()), self._scale(name)[1]]
+            self.quantized[wide, name] = self._add("Pad", given, f"{wide}.integers")
         return wide
 
-    def _narrowed(self, name: str, channels: int) -> str:
+    def _slice_channels(self, name: str, channels: int) -> str:
         """The first channels of a tensor."""
         bounds = {"starts": 0, "ends": channels, "axes": 1}
         given = [self._constant(f"{name}.{bound}", np.array([value], np.int64)) for bound, value in bounds.items()]
         return self._add("Slice", [name, *given], f"{name}.narrow")
 
-    def _integers(self, name: str, whose: str) -> str:
+    def _quantized(self, name: str, whose: str) -> str:
         """A tensor as integers in the range of another."""
-        if (name, whose) not in self.integers:
-            self.integers[name, whose] = self._quantize(name, whose)
-        return self.integers[name, whose]
+        if (name, whose) not in self.quantized:
+            self.quantized[name, whose] = self._quantize(name, whose)
+        return self.quantized[name, whose]
 
-    def _numbers(self, name: str, whose: str) -> str:
+    def _dequantized(self, name: str, whose: str) -> str:
         """A tensor as the numbers that its integers stand for."""
-        if (name, whose) not in self.numbers:
-            self.numbers[name, whose] = self._dequantize(self._integers(name, whose), whose, f"{name}.rounded")
-        return self.numbers[name, whose]
+        if (name, whose) not in self.dequantized:
+            self.dequantized[name, whose] = self._dequantize(self._quantized(name, whose), whose, f"{name}.rounded")
+        return self.dequantized[name, whose]
 
     def _quantize(self, name: str, whose: str) -> str:
         """A tensor taken to integers in the range of another."""

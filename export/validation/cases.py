@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from ...runtime.inference.metadata import Description
-from ..freeze import Fixed
 from ..room import room_inputs, with_room
 from ..stages import NamedTensors, example_inputs
+from ..tracing import StaticShape
 
 # Where views are not fixed; more than `ORDERED_VIEWS` of model/common/geometry.py, and more than a view has neighbours.
 MOST_VIEWS_OF_A_CASE = 5
@@ -35,17 +35,17 @@ class Case:
     tensors: dict[str, np.ndarray]
 
 
-def verification_cases(network: NamedTensors, description: Description, fixed: Fixed) -> Iterator[Case]:
+def verification_cases(network: NamedTensors, description: Description, static: StaticShape) -> Iterator[Case]:
     """Cases of different numbers of views, sizes and contents, as far as views and size are not fixed."""
     near, far, block = description.near, description.far, description.size_multiple
-    trained = fixed.size or (description.height, description.width)
-    across, upright = (fixed.size or (rows * block, columns * block) for rows, columns in ((6, 8), (8, 6)))
-    room = room_inputs(fixed.views or 2, *trained, near, far)
+    trained = static.size or (description.height, description.width)
+    across, upright = (static.size or (rows * block, columns * block) for rows, columns in ((6, 8), (8, 6)))
+    room = room_inputs(static.views or 2, *trained, near, far)
     yield _case(network, "room", room)
-    noise = example_inputs(fixed.views or MOST_VIEWS_OF_A_CASE, *across, near, far)
+    noise = example_inputs(static.views or MOST_VIEWS_OF_A_CASE, *across, near, far)
     yield _case(network, "noise", different_cameras(noise))
     nearer = NEARER * near
-    cameras = different_cameras(example_inputs(fixed.views or 3, *upright, nearer, far))
+    cameras = different_cameras(example_inputs(static.views or 3, *upright, nearer, far))
     yield _case(network, "room", with_room(cameras, nearer))
 
 

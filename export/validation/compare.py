@@ -21,9 +21,9 @@ import numpy as np
 from ...model.idesplat.network import IDESplat
 from ...runtime.inference.metadata import INPUTS, OUTPUTS, Description
 from ...runtime.inference.session import open_session, run_session
-from ..freeze import Fixed
-from ..precision.parts import FLOAT32
+from ..precision.convert import FLOAT32
 from ..stages import NamedTensors, Stage
+from ..tracing import StaticShape
 from .cases import Case, verification_cases
 
 ENCODER = "encoder"  # the stage that does not warp
@@ -113,9 +113,11 @@ class Exported:
     fused: Path | None = None
 
 
-def verify(network: NamedTensors, exported: Exported, description: Description, fixed: Fixed) -> Iterator[TensorError]:
+def verify(
+    network: NamedTensors, exported: Exported, description: Description, static: StaticShape
+) -> Iterator[TensorError]:
     """Compare the graph of every stage with the network, and everything that is handed out, end to end."""
-    cases = list(verification_cases(network, description, fixed))
+    cases = list(verification_cases(network, description, static))
     yield from compare(exported, cases, tolerance_for(network, description.precision))
 
 

@@ -11,15 +11,15 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from .gather_attention import SparseProducts
+from .gather_attention import GatherAttention
 from .geometry import Cameras, sampling_points, scale_intrinsics
-from .layers import fixed, repeat_views, to_tokens
+from .layers import repeat_views, static_dim, to_tokens
 
 CORNERS = 4  # pixels around a point
 
 
 def cost_volume(
-    features: Tensor, candidates: Tensor, cameras: Cameras, neighbours: Tensor, products: SparseProducts
+    features: Tensor, candidates: Tensor, cameras: Cameras, neighbours: Tensor, gather_attention: GatherAttention
 ) -> Tensor:
     """Correlation of features [views, channels, h, w] with those of the neighbours, warped: [views, candidates, h, w].
 
@@ -28,11 +28,11 @@ def cost_volume(
     which are the same in all that it was trained on.
     """
     views, _, height, width = features.shape
-    channels, count = fixed(features.shape[1]), fixed(candidates.shape[1])
+    channels, count = static_dim(features.shape[1]), static_dim(candidates.shape[1])
     intrinsics = scale_intrinsics(cameras.intrinsics, height, width)
     x, y = sampling_points(candidates, intrinsics, cameras.extrinsics, neighbours)
     if torch.onnx.is_in_onnx_export():
-        scores = by_gathering(features, neighbours, x, y, products)
+        scores = by_gathering(features, neighbours, x, y, gather_attention)
     else:
         scores = by_sampling(features, neighbours, x, y)
     scores = scores * channels**-0.5
@@ -48,15 +48,17 @@ def by_sampling(features: Tensor, neighbours: Tensor, x: Tensor, y: Tensor) -> T
     return (warped * own).sum(1)
 
 
-def by_gathering(features: Tensor, neighbours: Tensor, x: Tensor, y: Tensor, products: SparseProducts) -> Tensor:
+def by_gathering(
+    features: Tensor, neighbours: Tensor, x: Tensor, y: Tensor, gather_attention: GatherAttention
+) -> Tensor:
     """The same by gathering the features of the four pixels around each candidate."""
     own = repeat_views(to_tokens(features), neighbours.shape[1])  # [pairs, h * w, channels]
     table = to_tokens(bordered(features))  # [views, bordered pixels, channels]
     first = (neighbours.flatten() * table.shape[1]).to(torch.int32)[:, None, None]
     corners, across, down = corners_around(x, y, *features.shape[2:])
     rows = torch.cat([first + corner for corner in corners], dim=1)  # [pairs, 4 * candidates, h * w]
-    scores = products.correlate(own, table.flatten(0, 1), rows)
-    return interpolate(scores.split(fixed(x.shape[1]), dim=1), across, down)
+    scores = gather_attention.gathered_dot(own, table.flatten(0, 1), rows)
+    return interpolate(scores.split(static_dim(x.shape[1]), dim=1), across, down)
 
 
 def bordered(features: Tensor) -> Tensor:

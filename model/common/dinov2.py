@@ -71,7 +71,7 @@ class DinoV2(nn.Module):
         maps = []
         for index, block in enumerate(self.blocks):
             x = block(x)
-            if index in self.config.taps:
+            if index in self.config.out_indices:
                 maps.append(to_map(self.norm(x)[:, 1:], rows, columns))
         return maps
 

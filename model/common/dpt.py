@@ -48,15 +48,15 @@ class DPT(nn.Module):
         """`dim` is the ViT's; `channels` are those of the four reassembled maps, finest first."""
         super().__init__()
         self.projects = nn.ModuleList(nn.Conv2d(dim, count, 1) for count in channels)
-        self.grow4 = nn.ConvTranspose2d(channels[0], channels[0], 4, stride=4)
-        self.grow2 = nn.ConvTranspose2d(channels[1], channels[1], 2, stride=2)
-        self.shrink2 = nn.Conv2d(channels[3], channels[3], 3, stride=2, padding=1)
+        self.upsample4 = nn.ConvTranspose2d(channels[0], channels[0], 4, stride=4)
+        self.upsample2 = nn.ConvTranspose2d(channels[1], channels[1], 2, stride=2)
+        self.downsample = nn.Conv2d(channels[3], channels[3], 3, stride=2, padding=1)
         self.laterals = nn.ModuleList(nn.Conv2d(count, features, 3, padding=1, bias=False) for count in channels)
         self.fusions = nn.ModuleList(Fusion(features, lateral=level < 3) for level in range(4))
 
     def reassemble(self, first: Tensor, second: Tensor, third: Tensor, fourth: Tensor) -> list[Tensor]:
         """Projected maps of one size, [n, channels, rows, columns], to a pyramid of 4, 2, 1 and 1/2 times the size."""
-        return [self.grow4(first), self.grow2(second), third, self.shrink2(fourth)]
+        return [self.upsample4(first), self.upsample2(second), third, self.downsample(fourth)]
 
     def fuse(self, pyramid: list[Tensor]) -> Tensor:
         """The pyramid -> [n, features, 8 * rows, 8 * columns]."""

@@ -20,7 +20,7 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 MONO_STRIDE = 8
 
 
-class Encoded(NamedTuple):
+class EncoderFeatures(NamedTuple):
     """IDESplat's encoder's maps; h and w are the image's size over the feature stride."""
 
     neighbours: Tensor  # [views, n], the views that each is matched with
@@ -32,7 +32,7 @@ class Encoded(NamedTuple):
     mono_disparity: Tensor  # [views, 1, h, w], relative
 
 
-class EncodedPyramid(NamedTuple):
+class PyramidFeatures(NamedTuple):
     """DepthSplat's encoder's maps; h and w are the image's size over the feature stride."""
 
     neighbours: Tensor  # [views, n], the views that each is matched with
@@ -78,7 +78,7 @@ class Encoder(ViewEncoder):
             self.vit = DinoV2(config.vit)
             self.dpt = DPTHead(config.vit.dim, config.vit.patch, config.dpt)
 
-    def forward(self, images: Tensor, extrinsics: Tensor) -> Encoded:
+    def forward(self, images: Tensor, extrinsics: Tensor) -> EncoderFeatures:
         """Images [views, 3, H, W] in [0, 1], extrinsics [views, 4, 4] -> the encoder's maps."""
         neighbours = nearest_views(extrinsics, self.neighbours)
         normalised = normalise(images)
@@ -91,7 +91,7 @@ class Encoder(ViewEncoder):
             maps = self.mono_maps(normalised)
             mono, mono_out = maps[-1], self.dpt.features(maps)
             disparity = self.dpt.disparity(mono_out, *mono.shape[2:])
-        return Encoded(neighbours, cnn, cnn_fine, mv, resize(mono, *size), mono_out, resize(disparity, *size))
+        return EncoderFeatures(neighbours, cnn, cnn_fine, mv, resize(mono, *size), mono_out, resize(disparity, *size))
 
 
 class PyramidEncoder(ViewEncoder):
@@ -103,7 +103,7 @@ class PyramidEncoder(ViewEncoder):
         # The releases bring the ViT's maps to this stride first, and from there to a finer feature stride.
         self.growth = MONO_STRIDE // config.feature_stride
 
-    def forward(self, images: Tensor, extrinsics: Tensor) -> EncodedPyramid:
+    def forward(self, images: Tensor, extrinsics: Tensor) -> PyramidFeatures:
         """Images [views, 3, H, W] in [0, 1], extrinsics [views, 4, 4] -> the encoder's maps."""
         neighbours = nearest_views(extrinsics, self.neighbours)
         images = normalise(images)
@@ -113,7 +113,7 @@ class PyramidEncoder(ViewEncoder):
         mono = resize(maps[-1], images.shape[2] // MONO_STRIDE, images.shape[3] // MONO_STRIDE)
         if self.growth > 1:
             mono = resize(mono, *cnn.shape[2:])
-        return EncodedPyramid(neighbours, cnn, cnn_fine, cnn_finest, mv, mono, *maps)
+        return PyramidFeatures(neighbours, cnn, cnn_fine, cnn_finest, mv, mono, *maps)
 
 
 def normalise(images: Tensor) -> Tensor:

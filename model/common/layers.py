@@ -18,14 +18,14 @@ def softmax(x: Tensor, dim: int) -> Tensor:
     return exponentials / exponentials.sum(dim, keepdim=True)
 
 
-def fixed(size: int) -> int:
+def static_dim(size: int) -> int:
     """A size that the architecture fixes, as a plain integer, so that an export holds it as a constant."""
     return int(size)
 
 
 def attention(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None) -> Tensor:
     """Scaled dot-product attention over the last two axes, with a constant scale in an export."""
-    return F.scaled_dot_product_attention(q, k, v, attn_mask=mask, scale=fixed(q.shape[-1]) ** -0.5)
+    return F.scaled_dot_product_attention(q, k, v, attn_mask=mask, scale=static_dim(q.shape[-1]) ** -0.5)
 
 
 def repeat_views(x: Tensor, neighbours: int) -> Tensor:
@@ -40,7 +40,7 @@ def to_tokens(x: Tensor) -> Tensor:
 
 def to_map(tokens: Tensor, height: int, width: int) -> Tensor:
     """[n, h * w, channels] -> [n, channels, h, w]."""
-    return tokens.transpose(1, 2).reshape(-1, fixed(tokens.shape[2]), height, width)
+    return tokens.transpose(1, 2).reshape(-1, static_dim(tokens.shape[2]), height, width)
 
 
 class Upsample2x(nn.Sequential):
@@ -53,7 +53,7 @@ class Upsample2x(nn.Sequential):
         )
 
 
-class Merge(nn.Module):
+class ConcatConv1x1(nn.Module):
     """A 1x1 convolution over the concatenation of maps of any resolution, each resized to the asked size.
 
     A 1x1 convolution and a bilinear resize commute, so each part is convolved at its own, often much lower,

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .layers import fixed
+from .layers import static_dim
 
 # Added to the score between tokens that only a cyclic shift brought together.
 MASKED = -100.0
@@ -20,7 +20,7 @@ def split_windows(image: Tensor, rows: int, columns: int, shifted: bool = False)
     Shifted windows lie half a window further down and right, and go on at the opposite border.
     """
     count, height, width, _ = image.shape
-    channels = fixed(image.shape[3])
+    channels = static_dim(image.shape[3])
     if shifted:
         image = _moved(image, rows // 2, columns // 2)
     image = image.reshape(-1, height // rows, rows, width // columns, columns, channels)
@@ -29,7 +29,7 @@ def split_windows(image: Tensor, rows: int, columns: int, shifted: bool = False)
 
 def join_windows(windows: Tensor, height: int, width: int, rows: int, columns: int, shifted: bool = False) -> Tensor:
     """The inverse of `split_windows`, from windows [..., rows * columns, channels] to [n, h, w, channels]."""
-    channels = fixed(windows.shape[-1])
+    channels = static_dim(windows.shape[-1])
     image = windows.reshape(-1, height // rows, width // columns, rows, columns, channels)
     image = image.permute(0, 1, 3, 2, 4, 5).reshape(-1, height, width, channels)
     return _moved(image, height - rows // 2, width - columns // 2) if shifted else image
@@ -58,7 +58,7 @@ class Regions(NamedTuple):
 
     def split(self, windows: Tensor) -> list[Tensor]:
         """[n, windows, m * rows * columns, channels] -> four groups [regions, m * tokens of a region, channels]."""
-        channels = fixed(windows.shape[3])
+        channels = static_dim(windows.shape[3])
         grid = windows.reshape(-1, self.splits, self.splits, windows.shape[2], channels)
         groups = []
         for down, right in HALVES:
@@ -72,7 +72,7 @@ class Regions(NamedTuple):
 
     def join(self, groups: Sequence[Tensor]) -> Tensor:
         """The inverse of `split`, for m = 1."""
-        channels, tokens = fixed(groups[0].shape[2]), self.rows * self.columns
+        channels, tokens = static_dim(groups[0].shape[2]), self.rows * self.columns
         parts = []
         for (down, right), regions in zip(HALVES, groups, strict=True):
             across = self.columns // right * channels

@@ -7,8 +7,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..common.cost_volume import CORNERS, cost_volume
-from ..common.encoder import EncodedPyramid
-from ..common.gather_attention import SparseProducts
+from ..common.encoder import PyramidFeatures
+from ..common.gather_attention import GatherAttention
 from ..common.geometry import Cameras
 from ..common.layers import Upsample2x, resize, softmax
 from ..common.unet import CostRegulariser
@@ -16,7 +16,7 @@ from ..config import DepthSplatConfig
 from .upsampler import DepthUpsampler
 
 
-class Matched(NamedTuple):
+class DepthStageOutput(NamedTuple):
     """What a scale yields."""
 
     features_mv: Tensor  # [views, channels, h, w], the matching features at its resolution
@@ -26,11 +26,11 @@ class Matched(NamedTuple):
     inverse_depth_full: Tensor
 
 
-class PredictedDepth(NamedTuple):
+class DepthOutput(NamedTuple):
     """The result of the network that has no Gaussians, and the scale that it comes from."""
 
     depth: Tensor  # [views, H, W], metric z-depth
-    scale: Matched
+    scale: DepthStageOutput
 
 
 class DepthStage(nn.Module):
@@ -43,7 +43,7 @@ class DepthStage(nn.Module):
         self.stride = config.feature_stride // 2**scale
         cnn = (config.feature_channels, config.backbone_channels[1])[scale]
         matching = config.feature_channels // 2**scale
-        self.products = SparseProducts(CORNERS * self.candidates * matching, config.smallest_map(2**scale))
+        self.gather_attention = GatherAttention(CORNERS * self.candidates * matching, config.smallest_map(2**scale))
         inputs = self.candidates + cnn + matching + config.vit.dim // 2**scale
         self.regulariser = CostRegulariser(inputs, unet.channels, unet)
         self.shortcut = nn.Conv2d(inputs, unet.channels, 1)
@@ -55,14 +55,14 @@ class DepthStage(nn.Module):
         self, cnn: Tensor, mv: Tensor, mono: Tensor, candidates: Tensor, cameras: Cameras, neighbours: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Three maps [views, channels, h, w] and candidate inverse depths -> inverse depth and probability."""
-        costs = cost_volume(mv, candidates, cameras, neighbours, self.products)
+        costs = cost_volume(mv, candidates, cameras, neighbours, self.gather_attention)
         known = torch.cat([costs, cnn, mv, mono], dim=1)
         regular = self.regulariser.scores(known, known.shape[0]) + self.shortcut(known)
         probability = softmax(self.head2(F.gelu(self.head1(regular))), dim=1)
         return (probability * candidates).sum(1, keepdim=True), probability
 
     def at_image_size(
-        self, inverse_depth: Tensor, encoded: EncodedPyramid, features_mv: list[Tensor], cameras: Cameras
+        self, inverse_depth: Tensor, encoded: PyramidFeatures, features_mv: list[Tensor], cameras: Cameras
     ) -> Tensor:
         """Inverse depth [views, 1, h, w] -> [views, 1, H, W]."""
         height, width = inverse_depth.shape[2:]
@@ -80,7 +80,7 @@ class CoarseDepth(DepthStage):
     def __init__(self, config: DepthSplatConfig) -> None:
         super().__init__(config, scale=0)
 
-    def forward(self, encoded: EncodedPyramid, cameras: Cameras) -> Matched:
+    def forward(self, encoded: PyramidFeatures, cameras: Cameras) -> DepthStageOutput:
         """Encoded views -> inverse depth at the encoder's resolution."""
         mv = encoded.features_mv
         farthest, nearest = cameras.inverse_range()
@@ -90,7 +90,7 @@ class CoarseDepth(DepthStage):
             encoded.features_cnn, mv, encoded.features_mono, candidates, cameras, encoded.neighbours
         )
         full = self.at_image_size(inverse_depth, encoded, [mv], cameras)
-        return Matched(mv, inverse_depth, probability, full)
+        return DepthStageOutput(mv, inverse_depth, probability, full)
 
 
 class FineDepth(DepthStage):
@@ -100,28 +100,30 @@ class FineDepth(DepthStage):
         super().__init__(config, scale=1)
         # The first scale's intervals, and twice as many since this scale's are half as wide.
         self.intervals = 2 * (config.scales[0].candidates - 1)
-        self.grow_mv = Upsample2x(config.feature_channels)
-        self.grow_mono = Upsample2x(config.vit.dim)
+        self.upsample_mv = Upsample2x(config.feature_channels)
+        self.upsample_mono = Upsample2x(config.vit.dim)
 
-    def forward(self, encoded: EncodedPyramid, before: Matched, cameras: Cameras) -> Matched:
+    def forward(self, encoded: PyramidFeatures, before: DepthStageOutput, cameras: Cameras) -> DepthStageOutput:
         """Encoded views and the first scale -> inverse depth at twice its resolution."""
-        mv = self.grow_mv(encoded.features_mv)
+        mv = self.upsample_mv(encoded.features_mv)
         # As in the releases, this scale learns nothing through where the one before made it search.
-        seed = resize(before.inverse_depth, *mv.shape[2:]).detach()
-        candidates = self.candidates_around(seed, cameras)
-        mono = self.grow_mono(encoded.features_mono)
+        coarse_inverse_depth = resize(before.inverse_depth, *mv.shape[2:]).detach()
+        candidates = self.candidates_around(coarse_inverse_depth, cameras)
+        mono = self.upsample_mono(encoded.features_mono)
         inverse_depth, probability = self.match(
             encoded.features_cnn_fine, mv, mono, candidates, cameras, encoded.neighbours
         )
         full = self.at_image_size(inverse_depth, encoded, [encoded.features_mv, mv], cameras)
-        return Matched(mv, inverse_depth, probability, full)
+        return DepthStageOutput(mv, inverse_depth, probability, full)
 
-    def candidates_around(self, seed: Tensor, cameras: Cameras) -> Tensor:
-        """Candidates [views, candidates, h, w], evenly spaced around the seed within the cameras' range."""
+    def candidates_around(self, coarse_inverse_depth: Tensor, cameras: Cameras) -> Tensor:
+        """Candidates [views, candidates, h, w], evenly spaced around it within the cameras' range."""
         farthest, nearest = cameras.inverse_range()
         interval = (nearest - farthest) / self.intervals
         half = self.candidates // 2
-        low = torch.maximum(seed - interval * half, farthest)
-        high = torch.minimum(seed + interval * (half - 1), nearest)
-        steps = torch.linspace(0, 1, self.candidates, dtype=seed.dtype, device=seed.device)[None, :, None, None]
+        low = torch.maximum(coarse_inverse_depth - interval * half, farthest)
+        high = torch.minimum(coarse_inverse_depth + interval * (half - 1), nearest)
+        steps = torch.linspace(
+            0, 1, self.candidates, dtype=coarse_inverse_depth.dtype, device=coarse_inverse_depth.device
+        )[None, :, None, None]
         return low + steps * (high - low)

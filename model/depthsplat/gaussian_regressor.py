@@ -4,12 +4,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ..common.encoder import EncodedPyramid
+from ..common.encoder import PyramidFeatures
 from ..common.gaussian_adapter import BASE_PARAMETERS, GaussianAdapter
 from ..common.geometry import Cameras
 from ..config import DepthSplatConfig
-from ..idesplat.gaussian_head import Predicted
-from .depth_stage import Matched
+from ..idesplat.gaussian_head import ModelOutput
+from .depth_stage import DepthStageOutput
 from .upsampler import Upsampler
 
 
@@ -30,8 +30,8 @@ class GaussianRegressor(nn.Module):
         self.adapter = GaussianAdapter(config)
 
     def forward(
-        self, images: Tensor, cameras: Cameras, encoded: EncodedPyramid, scales: tuple[Matched, ...]
-    ) -> Predicted:
+        self, images: Tensor, cameras: Cameras, encoded: PyramidFeatures, scales: tuple[DepthStageOutput, ...]
+    ) -> ModelOutput:
         """Images [views, 3, H, W] in [0, 1] and all that is known of them -> depth and Gaussians."""
         depth = 1 / scales[-1].inverse_depth_full
         features = self.upsampler(encoded, [scale.features_mv for scale in scales])
@@ -40,4 +40,4 @@ class GaussianRegressor(nn.Module):
         regressed = F.gelu(self.regressor1(torch.cat([images, depth, certainty, features], dim=1)))
         regressed = self.regressor2(regressed)
         raw = self.head2(F.gelu(self.head1(torch.cat([regressed, images, features, certainty], dim=1))))
-        return Predicted(depth[:, 0], self.adapter(raw, depth[:, 0], images, cameras), features, raw)
+        return ModelOutput(depth[:, 0], self.adapter(raw, depth[:, 0], images, cameras), features, raw)

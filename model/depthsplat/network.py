@@ -9,11 +9,11 @@ heads (upsampler.py, gaussian_regressor.py), there by window attention over shuf
 
 from torch import Tensor, nn
 
-from ..common.encoder import EncodedPyramid, PyramidEncoder
+from ..common.encoder import PyramidEncoder, PyramidFeatures
 from ..common.geometry import Cameras
 from ..config import DepthSplatConfig
-from ..idesplat.gaussian_head import Predicted
-from .depth_stage import CoarseDepth, FineDepth, Matched, PredictedDepth
+from ..idesplat.gaussian_head import ModelOutput
+from .depth_stage import CoarseDepth, DepthOutput, DepthStageOutput, FineDepth
 from .gaussian_regressor import GaussianRegressor
 
 
@@ -30,7 +30,7 @@ class DepthScales(nn.Module):
             self.depth1 = CoarseDepth(config)
             self.depth2 = FineDepth(config)
 
-    def depth_stages(self, images: Tensor, cameras: Cameras) -> tuple[EncodedPyramid, tuple[Matched, ...]]:
+    def depth_stages(self, images: Tensor, cameras: Cameras) -> tuple[PyramidFeatures, tuple[DepthStageOutput, ...]]:
         """The encoded views and what each scale yields, coarsest first."""
         encoded = self.encoder(images, cameras.extrinsics)
         if len(self.config.scales) == 1:
@@ -53,7 +53,7 @@ class DepthSplat(DepthScales):
         super().__init__(config)
         self.gaussians = GaussianRegressor(config)
 
-    def forward(self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor, near: Tensor, far: Tensor) -> Predicted:
+    def forward(self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor, near: Tensor, far: Tensor) -> ModelOutput:
         """Predict depth and Gaussians.
 
         images: [views, 3, H, W], RGB in [0, 1]; H and W multiples of `config.size_multiple`, two views or more.
@@ -65,7 +65,7 @@ class DepthSplat(DepthScales):
 
     def stages(
         self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor, near: Tensor, far: Tensor
-    ) -> tuple[EncodedPyramid, *tuple[Matched, ...], Predicted]:
+    ) -> tuple[PyramidFeatures, *tuple[DepthStageOutput, ...], ModelOutput]:
         """What each stage yields, in order, for parity and for training with every stage supervised."""
         cameras = Cameras(extrinsics, intrinsics, near, far)
         encoded, scales = self.depth_stages(images, cameras)
@@ -75,15 +75,13 @@ class DepthSplat(DepthScales):
 class DepthSplatDepth(DepthScales):
     """DepthSplat without Gaussians, as the depth-only checkpoints have it: the last scale's depth is the result."""
 
-    def forward(
-        self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor, near: Tensor, far: Tensor
-    ) -> PredictedDepth:
+    def forward(self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor, near: Tensor, far: Tensor) -> DepthOutput:
         """Predict depth; arguments as for `DepthSplat`."""
         return self.stages(images, extrinsics, intrinsics, near, far)[-1]
 
     def stages(
         self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor, near: Tensor, far: Tensor
-    ) -> tuple[EncodedPyramid, *tuple[Matched, ...], PredictedDepth]:
+    ) -> tuple[PyramidFeatures, *tuple[DepthStageOutput, ...], DepthOutput]:
         """What each stage yields, in order, for parity and for training with every stage supervised."""
         encoded, (*before, last) = self.depth_stages(images, Cameras(extrinsics, intrinsics, near, far))
-        return encoded, *before, PredictedDepth(1 / last.inverse_depth_full[:, 0], last)
+        return encoded, *before, DepthOutput(1 / last.inverse_depth_full[:, 0], last)

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..common.dpt import DPT
-from ..common.encoder import MONO_STRIDE, EncodedPyramid
+from ..common.encoder import MONO_STRIDE, PyramidFeatures
 from ..common.layers import resize
 from ..config import DepthSplatConfig
 
@@ -40,7 +40,7 @@ class Upsampler(DPT):
             joined = sum(_at(stride, cnn_channels, self.cnn_strides)) + sum(_at(stride, joining, self.joining_strides))
             self.merges.append(nn.Conv2d(joined + count, count, 1))
 
-    def forward(self, encoded: EncodedPyramid, joining: list[Tensor]) -> Tensor:
+    def forward(self, encoded: PyramidFeatures, joining: list[Tensor]) -> Tensor:
         """Encoded views, and the maps that join them -> [views, features, H, W].
 
         joining: the matching features of each scale and, where the upsampler takes it, the last scale's inverse depth.
@@ -72,7 +72,7 @@ class DepthUpsampler(Upsampler):
         nn.init.zeros_(self.residual3.weight)
         nn.init.zeros_(self.residual3.bias)  # type: ignore[arg-type]
 
-    def forward(self, encoded: EncodedPyramid, joining: list[Tensor]) -> Tensor:
+    def forward(self, encoded: PyramidFeatures, joining: list[Tensor]) -> Tensor:
         """As for `Upsampler` -> the residual of the inverse depth, [views, 1, H, W]."""
         x = F.gelu(self.residual1(super().forward(encoded, joining)))
         return self.residual3(F.gelu(self.residual2(x)))

@@ -8,14 +8,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..common.encoder import Encoded
+from ..common.encoder import EncoderFeatures
 from ..common.geometry import Cameras, nearest_pixels, scale_intrinsics
-from ..common.layers import Merge, Upsample2x, fixed, resize
+from ..common.layers import ConcatConv1x1, Upsample2x, resize, static_dim
 from ..config import DPBUConfig, IDESplatConfig
 from .epipolar_attention import EpipolarAttention
 
 
-class Boosted(NamedTuple):
+class DPBUOutput(NamedTuple):
     """What a unit hands to the next."""
 
     features: Tensor  # [views, channels, h, w] after the attention
@@ -26,7 +26,7 @@ class Boosted(NamedTuple):
     candidates: Tensor  # [views, candidates, h, w] inverse depths
 
 
-class DepthProbabilityBoostingUnit(nn.Module):
+class DPBU(nn.Module):
     """The part that all three units share."""
 
     def __init__(self, config: IDESplatConfig, unit: DPBUConfig) -> None:
@@ -36,28 +36,34 @@ class DepthProbabilityBoostingUnit(nn.Module):
         self.second = EpipolarAttention(config, unit)
 
     def boost(
-        self, features: Tensor, context: Tensor, seed: Tensor, candidates: Tensor, neighbours: Tensor, cameras: Cameras
-    ) -> Boosted:
-        """Run two layers over the same warp indices, starting from `features` and the inverse depth `seed`."""
+        self,
+        features: Tensor,
+        context: Tensor,
+        coarse_inverse_depth: Tensor,
+        candidates: Tensor,
+        neighbours: Tensor,
+        cameras: Cameras,
+    ) -> DPBUOutput:
+        """Run two layers over the same warp indices, starting from `features` and `coarse_inverse_depth`."""
         height, width = features.shape[2:]
         pixels = scale_intrinsics(cameras.intrinsics, height, width)
         rows = nearest_pixels(candidates, pixels, cameras.extrinsics, neighbours)
-        features, prior = self.first(features, seed, rows, None)
+        features, prior = self.first(features, coarse_inverse_depth, rows, None)
         first_depth, _ = expectation(prior, candidates)
         features, posterior = self.second(features, first_depth, rows, prior)
         inverse_depth, probability = expectation(posterior, candidates)
-        return Boosted(features, context, first_depth, inverse_depth, probability, candidates)
+        return DPBUOutput(features, context, first_depth, inverse_depth, probability, candidates)
 
 
-class CoarseUnit(DepthProbabilityBoostingUnit):
+class CoarseDPBU(DPBU):
     """The first unit: it searches the whole range, and starts from the encoder's features and monocular disparity."""
 
     def __init__(self, config: IDESplatConfig, unit: DPBUConfig) -> None:
         super().__init__(config, unit)
         parts = (config.feature_channels, config.feature_channels, *config.mono_channels)
-        self.merge = Merge(parts, unit.channels)
+        self.merge = ConcatConv1x1(parts, unit.channels)
 
-    def forward(self, encoded: Encoded, cameras: Cameras) -> Boosted:
+    def forward(self, encoded: EncoderFeatures, cameras: Cameras) -> DPBUOutput:
         """Encoded views -> features and inverse depth at the encoder's resolution."""
         size = encoded.features_cnn.shape[2:]
         at_size = [encoded.features_cnn, encoded.features_mv, encoded.features_mono]
@@ -68,7 +74,7 @@ class CoarseUnit(DepthProbabilityBoostingUnit):
         return self.boost(context, context, encoded.mono_disparity, candidates, encoded.neighbours, cameras)
 
 
-class FinerUnit(DepthProbabilityBoostingUnit):
+class RefinementDPBU(DPBU):
     """The second or third unit: twice the resolution, candidates around the inverse depth of the unit before."""
 
     def __init__(self, config: IDESplatConfig, unit: DPBUConfig, before: DPBUConfig, context: int) -> None:
@@ -76,38 +82,40 @@ class FinerUnit(DepthProbabilityBoostingUnit):
         super().__init__(config, unit)
         # The coarse unit's intervals, and by how much this unit's are narrower.
         self.intervals = (config.dpbus[0].candidates - 1) * unit.scale
-        self.grow_features = Upsample2x(before.channels)
-        self.grow_context = Upsample2x(context)
+        self.upsample_features = Upsample2x(before.channels)
+        self.upsample_context = Upsample2x(context)
         # The CNN has a map of the second unit's resolution itself; only the third must grow it.
         cnn = config.backbone_channels[1]
-        self.grow_cnn = Upsample2x(cnn) if unit.scale > 2 else nn.Identity()
+        self.upsample_cnn = Upsample2x(cnn) if unit.scale > 2 else nn.Identity()
         cnn = cnn // 2 if unit.scale > 2 else cnn
-        self.merge = Merge((before.channels // 2, context // 2, cnn, *config.mono_channels), unit.channels)
+        self.merge = ConcatConv1x1((before.channels // 2, context // 2, cnn, *config.mono_channels), unit.channels)
 
-    def forward(self, encoded: Encoded, before: Boosted, cameras: Cameras) -> Boosted:
+    def forward(self, encoded: EncoderFeatures, before: DPBUOutput, cameras: Cameras) -> DPBUOutput:
         """Encoded views and the unit before -> features and inverse depth at twice its resolution."""
-        context = self.grow_context(before.context)
+        context = self.upsample_context(before.context)
         size = context.shape[2:]
-        at_size = [self.grow_features(before.features), context, self.grow_cnn(encoded.features_cnn_fine)]
+        at_size = [self.upsample_features(before.features), context, self.upsample_cnn(encoded.features_cnn_fine)]
         features = self.merge(at_size, [encoded.features_mono, encoded.mono_out], *size)
-        seed = resize(before.inverse_depth, *size)
-        candidates = self.candidates_around(seed, cameras)
-        return self.boost(features, context, seed, candidates, encoded.neighbours, cameras)
+        coarse_inverse_depth = resize(before.inverse_depth, *size)
+        candidates = self.candidates_around(coarse_inverse_depth, cameras)
+        return self.boost(features, context, coarse_inverse_depth, candidates, encoded.neighbours, cameras)
 
-    def candidates_around(self, seed: Tensor, cameras: Cameras) -> Tensor:
-        """Candidates [views, candidates, h, w], evenly spaced around the seed within the cameras' range."""
+    def candidates_around(self, coarse_inverse_depth: Tensor, cameras: Cameras) -> Tensor:
+        """Candidates [views, candidates, h, w], evenly spaced around it within the cameras' range."""
         farthest, nearest = cameras.inverse_range()
         half = (self.candidates - 1) / 2
         reach = (nearest - farthest) / self.intervals * half
-        low = torch.maximum(seed - reach, farthest)
-        high = torch.minimum(seed + reach, nearest)
-        steps = torch.linspace(-half, half, self.candidates, dtype=seed.dtype, device=seed.device)[None, :, None, None]
+        low = torch.maximum(coarse_inverse_depth - reach, farthest)
+        high = torch.minimum(coarse_inverse_depth + reach, nearest)
+        steps = torch.linspace(
+            -half, half, self.candidates, dtype=coarse_inverse_depth.dtype, device=coarse_inverse_depth.device
+        )[None, :, None, None]
         return (low + high) / 2 + steps * ((high - low) / (self.candidates - 1))
 
 
 def expectation(probability: Tensor, candidates: Tensor) -> tuple[Tensor, Tensor]:
     """Probabilities [pairs, candidates, h * w] -> expected inverse depth and probabilities, by view as maps."""
     views, _, height, width = candidates.shape
-    count = fixed(candidates.shape[1])
+    count = static_dim(candidates.shape[1])
     probability = probability.reshape(views, -1, count, height * width).mean(1).reshape(-1, count, height, width)
     return (probability * candidates).sum(1, keepdim=True), probability

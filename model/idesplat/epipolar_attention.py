@@ -6,8 +6,8 @@ The releases multiply sparsely in a CUDA extension; here the same sums run over 
 import torch
 from torch import Tensor, nn
 
-from ..common.gather_attention import SparseProducts, pixel_table
-from ..common.layers import ConvFFN, fixed, repeat_views, to_map, to_tokens
+from ..common.gather_attention import GatherAttention, pixel_table
+from ..common.layers import ConvFFN, repeat_views, static_dim, to_map, to_tokens
 from ..common.unet import CostRegulariser
 from ..config import DPBUConfig, IDESplatConfig
 
@@ -22,7 +22,7 @@ class EpipolarAttention(nn.Module):
         super().__init__()
         channels, candidates = unit.channels, unit.candidates
         self.scale = channels**-0.5
-        self.products = SparseProducts(channels * candidates, network.smallest_map(unit.scale))
+        self.gather_attention = GatherAttention(channels * candidates, network.smallest_map(unit.scale))
         # Position embeddings of the candidates, for keys, values and scores.
         self.key_position = nn.Parameter(torch.zeros(candidates))
         self.value_position = nn.Parameter(torch.zeros(candidates))
@@ -38,10 +38,12 @@ class EpipolarAttention(nn.Module):
         self.norm2 = nn.LayerNorm(channels)
         self.ffn = ConvFFN(channels, network.ffn_ratio, network.ffn_kernel)
 
-    def forward(self, features: Tensor, seed: Tensor, rows: Tensor, prior: Tensor | None) -> tuple[Tensor, Tensor]:
+    def forward(
+        self, features: Tensor, coarse_inverse_depth: Tensor, rows: Tensor, prior: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
         """Attend along the epipolar lines.
 
-        features: [views, channels, h, w]; seed: what is known of the inverse depth, [views, 1, h, w].
+        features: [views, channels, h, w]; coarse_inverse_depth: what is known of the inverse depth, [views, 1, h, w].
         rows: warp indices [pairs, candidates, h * w], pairs = views * neighbours (geometry.nearest_pixels).
         prior: the previous layer's probabilities [pairs, candidates, h * w], which this layer's multiply.
         Returns features of the same shape and the probabilities.
@@ -51,19 +53,27 @@ class EpipolarAttention(nn.Module):
         tokens = to_tokens(features)
         normed = self.norm1(tokens)
         queries = repeat_views(self.q_proj(normed) * self.scale, neighbours)
-        scores = self.products.correlate(queries, pixel_table(self.k_proj(normed)), rows)  # [pairs, candidates, h * w]
+        scores = self.gather_attention.gathered_dot(
+            queries, pixel_table(self.k_proj(normed)), rows
+        )  # [pairs, candidates, h * w]
         scores = scores + queries.sum(-1)[:, None] * self.key_position[:, None] + self.score_position[:, None]
 
         known = torch.cat(
-            [repeat_views(seed, neighbours), scores.reshape(-1, fixed(scores.shape[1]), height, width)], dim=1
+            [
+                repeat_views(coarse_inverse_depth, neighbours),
+                scores.reshape(-1, static_dim(scores.shape[1]), height, width),
+            ],
+            dim=1,
         )
         probability = self.regulariser(known, views).flatten(2)
         if prior is not None:  # depth probability boosting
             product = probability * prior
             probability = (product + EPSILON) / (product.sum(1, keepdim=True) + EPSILON)
 
-        gathered = self.products.weigh(probability, pixel_table(self.v_proj(normed)), rows)  # [pairs, h * w, channels]
+        gathered = self.gather_attention.gathered_weighted_sum(
+            probability, pixel_table(self.v_proj(normed)), rows
+        )  # [pairs, h * w, channels]
         gathered = gathered + (probability * self.value_position[:, None]).sum(1)[..., None]
-        tokens = tokens + self.proj(gathered.reshape(views, neighbours, -1, fixed(gathered.shape[2])).mean(1))
+        tokens = tokens + self.proj(gathered.reshape(views, neighbours, -1, static_dim(gathered.shape[2])).mean(1))
         tokens = tokens + self.ffn(self.norm2(tokens), height, width)
         return to_map(tokens, height, width), probability

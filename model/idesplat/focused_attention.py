@@ -51,9 +51,9 @@ class FocusedLayer(nn.Module):
         tokens = self.window**2
         self.shifted = index % 2 == 1
         self.topk = config.topk[index]
-        self.drops = self.topk < (config.topk[index - 2] if index >= 2 else tokens)
+        self.prunes = self.topk < (config.topk[index - 2] if index >= 2 else tokens)
         # Whether the layer before of the same kind has dropped neighbours already.
-        self.narrowed = index >= 2 and config.topk[index - 2] < tokens
+        self.pruned = index >= 2 and config.topk[index - 2] < tokens
         self.norm1 = nn.LayerNorm(channels)
         self.q_proj = nn.Linear(channels, channels)
         self.k_proj = nn.Linear(channels, channels)
@@ -83,7 +83,7 @@ class FocusedLayer(nn.Module):
         """Attention over the neighbours that are left, the `topk` strongest kept."""
         scores = (q * self.head_channels**-0.5) @ k.transpose(-1, -2)  # [views, windows, heads, tokens, tokens]
         scores = scores + self.position_bias[self.position_index].permute(2, 0, 1)
-        if before is not None and self.narrowed:
+        if before is not None and self.pruned:
             # The releases leave the mask away from here on: what it hid has all but zero weight in `before`.
             scores = torch.where(before > 0, scores, -torch.inf)
         elif self.shifted:
@@ -91,10 +91,10 @@ class FocusedLayer(nn.Module):
         attention = scores.softmax(-1)
         if before is not None:
             product = attention * before + EPSILON
-            if self.narrowed:
+            if self.pruned:
                 product = torch.where(before > 0, product, 0.0)
             attention = product / (product.sum(-1, keepdim=True) + EPSILON)
-        if self.drops:
+        if self.prunes:
             # The least of the strongest is found in half the time where they need not be in order.
             weakest = attention.topk(self.topk, dim=-1, sorted=False).values.amin(-1, keepdim=True)
             attention = torch.where(attention >= weakest, attention, 0.0)

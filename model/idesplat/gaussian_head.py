@@ -6,14 +6,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ..common.encoder import Encoded, normalise
+from ..common.encoder import EncoderFeatures, normalise
 from ..common.gaussian_adapter import BASE_PARAMETERS, GaussianAdapter, WorldGaussians
 from ..common.geometry import Cameras
 from ..common.layers import resize
 from ..common.unet import CostRegulariser
 from ..config import IDESplatConfig
 from .cross_view import CHANNELS, cross_view_features
-from .dpbu import Boosted
+from .dpbu import DPBUOutput
 from .focused_attention import GaussianFocusedModule
 
 # Shares of the three units' and the residual head's inverse depth in the final one (mv_unimatch.py).
@@ -24,7 +24,7 @@ SHUFFLE = 4
 IMAGE_SHARE = 16
 
 
-class Predicted(NamedTuple):
+class ModelOutput(NamedTuple):
     """The network's result, and the two maps before it that parity looks at."""
 
     depth: Tensor  # [views, H, W], metric z-depth
@@ -80,29 +80,37 @@ class GaussianStage(nn.Module):
         self.adapter = GaussianAdapter(config)
 
     def forward(
-        self, images: Tensor, cameras: Cameras, encoded: Encoded, units: tuple[Boosted, Boosted, Boosted]
-    ) -> Predicted:
+        self,
+        images: Tensor,
+        cameras: Cameras,
+        encoded: EncoderFeatures,
+        units: tuple[DPBUOutput, DPBUOutput, DPBUOutput],
+    ) -> ModelOutput:
         """Images [views, 3, H, W] in [0, 1] and all that is known of them -> depth and Gaussians."""
         return self.predict(images, cameras, self.head_inputs(images, cameras, encoded, units))
 
     def head_inputs(
-        self, images: Tensor, cameras: Cameras, encoded: Encoded, units: tuple[Boosted, Boosted, Boosted]
+        self,
+        images: Tensor,
+        cameras: Cameras,
+        encoded: EncoderFeatures,
+        units: tuple[DPBUOutput, DPBUOutput, DPBUOutput],
     ) -> HeadInputs:
         """Everything up to the final inverse depth; none of it changes while the Gaussian head alone is trained."""
         inverse_depth = self.fused_inverse_depth(units, cameras, *images.shape[2:])
         return HeadInputs(inverse_depth, encoded.features_cnn, units[0].context, units[2].features, encoded.neighbours)
 
-    def predict(self, images: Tensor, cameras: Cameras, inputs: HeadInputs) -> Predicted:
+    def predict(self, images: Tensor, cameras: Cameras, inputs: HeadInputs) -> ModelOutput:
         """Focused module, Gaussian head and adapter."""
         features = self.pixel_features(normalise(images), inputs)
         raw = self.head2(F.gelu(self.head1(features)))
         if self.cross_view is not None:
             raw = raw + self.cross_view(images, cameras, inputs)
         depth = 1 / inputs.inverse_depth[:, 0]
-        return Predicted(depth, self.adapter(raw, depth, images, cameras), features, raw)
+        return ModelOutput(depth, self.adapter(raw, depth, images, cameras), features, raw)
 
     def fused_inverse_depth(
-        self, units: tuple[Boosted, Boosted, Boosted], cameras: Cameras, height: int, width: int
+        self, units: tuple[DPBUOutput, DPBUOutput, DPBUOutput], cameras: Cameras, height: int, width: int
     ) -> Tensor:
         """The shares of the units and of the residual head, within the cameras' range: [views, 1, height, width]."""
         last = units[2]

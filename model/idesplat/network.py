@@ -5,11 +5,11 @@ Read beside `depthsplat.py`, which says what the two share and where they part.
 
 from torch import Tensor, nn
 
-from ..common.encoder import Encoded, Encoder
+from ..common.encoder import Encoder, EncoderFeatures
 from ..common.geometry import Cameras
 from ..config import IDESplatConfig
-from .dpbu import Boosted, CoarseUnit, FinerUnit
-from .gaussian_head import GaussianStage, Predicted
+from .dpbu import CoarseDPBU, DPBUOutput, RefinementDPBU
+from .gaussian_head import GaussianStage, ModelOutput
 
 
 class IDESplat(nn.Module):
@@ -25,12 +25,12 @@ class IDESplat(nn.Module):
         self.config = config
         first, second, third = config.dpbus
         self.encoder = Encoder(config)
-        self.dpbu1 = CoarseUnit(config, first)
-        self.dpbu2 = FinerUnit(config, second, first, context=first.channels)
-        self.dpbu3 = FinerUnit(config, third, second, context=first.channels // 2)
+        self.dpbu1 = CoarseDPBU(config, first)
+        self.dpbu2 = RefinementDPBU(config, second, first, context=first.channels)
+        self.dpbu3 = RefinementDPBU(config, third, second, context=first.channels // 2)
         self.gaussians = GaussianStage(config)
 
-    def forward(self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor, near: Tensor, far: Tensor) -> Predicted:
+    def forward(self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor, near: Tensor, far: Tensor) -> ModelOutput:
         """Predict depth and Gaussians.
 
         images: [views, 3, H, W], RGB in [0, 1]; H and W multiples of `config.size_multiple`, two views or more.
@@ -42,7 +42,7 @@ class IDESplat(nn.Module):
 
     def stages(
         self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor, near: Tensor, far: Tensor
-    ) -> tuple[Encoded, Boosted, Boosted, Boosted, Predicted]:
+    ) -> tuple[EncoderFeatures, DPBUOutput, DPBUOutput, DPBUOutput, ModelOutput]:
         """What each stage yields, in order, for parity and for training with every stage supervised."""
         cameras = Cameras(extrinsics, intrinsics, near, far)
         encoded = self.encoder(images, extrinsics)

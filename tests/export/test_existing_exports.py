@@ -10,10 +10,16 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
-from idesplat.export import written
+from idesplat.export import existing_exports as written
+from idesplat.export.existing_exports import (
+    check_replaceable,
+    foreign_entries,
+    is_our_graph,
+    replace_folder,
+    working_folder,
+)
 from idesplat.export.graph import external_data as weights
-from idesplat.export.graph.external_data import hand_out, publish
-from idesplat.export.written import check_replaceable, foreign_entries, is_our_graph, replace_folder, working_folder
+from idesplat.export.graph.external_data import publish, save_model
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.inference.metadata import MANIFEST_NAME, METADATA_KEY, StageFile, write_manifest
 from onnx import TensorProto, helper, numpy_helper
@@ -269,7 +275,7 @@ def test_a_graph_and_its_weights_belong_together_wherever_a_run_is_killed(tmp_pa
     def export(value):
         with working_folder(place) as working:
             (working / "fused").mkdir()
-            return publish(hand_out(source / f"{value}.onnx", working / "fused" / "model.onnx"), place)
+            return publish(save_model(source / f"{value}.onnx", working / "fused" / "model.onnx"), place)
 
     def restore():
         shutil.rmtree(place, ignore_errors=True)
@@ -297,14 +303,14 @@ def test_weights_of_a_graph_that_was_replaced_go_unless_another_graph_reads_them
     place.mkdir()
     save_external(graph(1), source / "graph.onnx")
     monkeypatch.setattr(weights, "LARGEST_FILE", 1000)
-    _, beside = publish(hand_out(source / "graph.onnx", source / "model.onnx"), place)
+    _, beside = publish(save_model(source / "graph.onnx", source / "model.onnx"), place)
     shutil.copy(place / "model.onnx", place / "copy.onnx")
     (place / "model.onnx.0123456789abcdef.data").write_text("not what the name says")
     monkeypatch.undo()
-    publish(hand_out(source / "graph.onnx", source / "model.onnx"), place)
+    publish(save_model(source / "graph.onnx", source / "model.onnx"), place)
     assert value_of(place / "copy.onnx") == value_of(place / "model.onnx") == 1
     (place / "copy.onnx").unlink()
-    publish(hand_out(source / "graph.onnx", source / "model.onnx"), place)
+    publish(save_model(source / "graph.onnx", source / "model.onnx"), place)
     assert not beside.exists()
     assert {path.name for path in place.iterdir()} == {"model.onnx", "model.onnx.0123456789abcdef.data"}
 

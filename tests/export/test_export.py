@@ -126,8 +126,8 @@ def test_a_departing_graph_leaves_no_file(small_checkpoint, presets, tmp_path, m
 
 def test_verification_notices_a_wrong_graph(exported):
     """The very comparison that guards the export fails when the weights differ by one part in ten of one tensor."""
-    from idesplat.export.freeze import Fixed
     from idesplat.export.stages import NamedTensors, Stage
+    from idesplat.export.tracing import StaticShape
     from idesplat.export.validation.compare import Exported, verify
 
     network = NamedTensors(small_network())
@@ -139,7 +139,7 @@ def test_verification_notices_a_wrong_graph(exported):
         (Stage(stage.name, tuple(stage.inputs), tuple(stage.outputs)), exported[1] / stage.file)
         for stage in read_manifest(exported[1])
     ]
-    rows = list(verify(network, Exported(stages, staged=False), description, Fixed()))
+    rows = list(verify(network, Exported(stages, staged=False), description, StaticShape()))
     assert {row.stage for row in rows if not row.passed} == {"dpbu1"}
 
 
@@ -199,7 +199,7 @@ def test_a_full_disk_is_named_and_leaves_nothing(small_checkpoint, presets, tmp_
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("idesplat.export.freeze.freeze", full)
+    monkeypatch.setattr("idesplat.export.tracing.export_graphs", full)
     assert run_command(cli.main, small_checkpoint, tmp_path / "out.onnx", "--staged", tmp_path / "staged") == 2
     message = capsys.readouterr().err.splitlines()[-1]
     assert message.startswith("error: ") and "No space left on device" in message

@@ -20,7 +20,7 @@ from camera_cases import known
 from conftest import SMALL
 from hypothesis import given
 from hypothesis import strategies as st
-from idesplat.export.written import foreign_entries, is_our_graph
+from idesplat.export.existing_exports import foreign_entries, is_our_graph
 from idesplat.model.checkpoint import CheckpointError, read_state_dict
 from idesplat.runtime import Runner
 from idesplat.runtime.cameras.io import CameraFormat, read_cameras, write_cameras

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from idesplat.model.config import DepthScaleConfig, DepthSplatConfig, UNetConfig, UpsamplerConfig, ViTConfig
 
-VIT = ViTConfig(dim=48, depth=4, heads=2, taps=(0, 1, 2, 3))
+VIT = ViTConfig(dim=48, depth=4, heads=2, out_indices=(0, 1, 2, 3))
 
 
 SMALL = DepthSplatConfig(

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import torch
 from idesplat.export.cli import describe
-from idesplat.export.freeze import Fixed, freeze
-from idesplat.export.precision.parts import PRECISIONS
+from idesplat.export.precision.convert import PRECISIONS
 from idesplat.export.stages import NamedTensors
+from idesplat.export.tracing import StaticShape, export_graphs
 from idesplat.export.validation.cases import Case
 from idesplat.export.validation.compare import Exported, compare, tolerance_for
 from idesplat.model.checkpoint import fill
@@ -69,7 +69,9 @@ def variants(
     stages: dict[str, float | None] = {"PyTorch": None}
     for precision in PRECISIONS:
         (folder / precision).mkdir()
-        graphs = freeze(network, describe(model, "", "", "", Fixed(), precision), Fixed(), folder / precision)
+        graphs = export_graphs(
+            network, describe(model, "", "", "", StaticShape(), precision), StaticShape(), folder / precision
+        )
         exported = Exported([(stage, graphs.of_stage(stage)) for stage in graphs.stages], staged=False)
         rows = compare(exported, [between], tolerance_for(network, precision))
         stages[precision] = max(row.errors.median for row in rows)

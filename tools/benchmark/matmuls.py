@@ -16,8 +16,8 @@ import torch
 import typer
 from torch import Tensor, nn
 
-from ...export.graph.gather_loops import FEW, explain, in_steps
-from ...model.common.gather_attention import SparseProducts
+from ...export.graph.gather_loops import FEW, chunked, lower_custom_ops
+from ...model.common.gather_attention import GatherAttention
 from ...runtime.cli.terminal import run
 from .cli import thread_environment
 from .components import race
@@ -64,7 +64,7 @@ def main(
                 "gathered at once": (products, shape, False, threads),
                 "in steps": (products, shape, True, threads),
             }
-            race(f"{name}: correlate and weigh", contestants, repeats)
+            race(f"{name}: gathered dot and weighted sum", contestants, repeats)
 
 
 def products(shape: Shape, steps: bool, threads: int) -> Prepared:
@@ -87,11 +87,13 @@ class Both(nn.Module):
 
     def __init__(self, block: int) -> None:
         super().__init__()
-        self.products = SparseProducts(FEW, block)
+        self.gather_attention = GatherAttention(FEW, block)
 
     def forward(self, queries: Tensor, table: Tensor, rows: Tensor) -> Tensor:
-        """As `SparseProducts`: the rows weighed by their scores, [pairs, h * w, channels]."""
-        return self.products.weigh(self.products.correlate(queries, table, rows), table, rows)
+        """As `GatherAttention`: the rows weighed by their scores, [pairs, h * w, channels]."""
+        return self.gather_attention.gathered_weighted_sum(
+            self.gather_attention.gathered_dot(queries, table, rows), table, rows
+        )
 
 
 def exported(block: int, arrays: tuple[np.ndarray, ...], steps: bool) -> onnx.ModelProto:
@@ -101,11 +103,11 @@ def exported(block: int, arrays: tuple[np.ndarray, ...], steps: bool) -> onnx.Mo
         warnings.simplefilter("ignore")  # deprecation of the path, and tracing warnings
         path = Path(folder) / "both.onnx"
         tensors = tuple(torch.from_numpy(array) for array in arrays)
-        with in_steps(network) if steps else nullcontext():
+        with chunked(network) if steps else nullcontext():
             torch.onnx.export(
                 network, tensors, str(path), dynamo=False, opset_version=20, input_names=list(INPUTS), dynamic_axes=AXES
             )
-        return explain(onnx.load(path))
+        return lower_custom_ops(onnx.load(path))
 
 
 def example(shape: Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

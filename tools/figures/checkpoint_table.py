@@ -150,7 +150,7 @@ def measure(preset: str, repeats: int) -> Measured:
 def drawn(preset: str, checkpoint: Path, workload: Workload) -> Prepared:
     """Write drawn weights; `about` holds how many they are, and the depth that PyTorch makes of them."""
     network = build(preset).eval()
-    draw(network)
+    randomize_weights(network)
     torch.save({"state_dict": network.state_dict()}, checkpoint)
     images, extrinsics, intrinsics, near, far = example_arrays(workload, network.config.near, network.config.far)
     frame = SceneFrame.of(extrinsics, near, network.config.near)
@@ -192,7 +192,7 @@ def _timed(run: Callable[[], object]) -> Callable[[], float]:
     return timed
 
 
-def draw(network: Network, seed: int = 0) -> None:
+def randomize_weights(network: Network, seed: int = 0) -> None:
     """Fill a network with random weights that let signals through, as the reference cases have them."""
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():

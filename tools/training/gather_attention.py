@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...model.common.gather_attention import SparseProducts
+from ...model.common.gather_attention import GatherAttention
 from ...model.idesplat.network import IDESplat
 
 _compiled = functools.partial(
@@ -19,8 +19,8 @@ _compiled = functools.partial(
 def with_compiled_products(model: IDESplat) -> IDESplat:
     """The same network, whose epipolar layers multiply here: the same sums, ten times as fast."""
     for products in model.modules():
-        if isinstance(products, SparseProducts):
-            products.correlate, products.weigh = correlate, weigh
+        if isinstance(products, GatherAttention):
+            products.gathered_dot, products.gathered_weighted_sum = gathered_dot, gathered_weighted_sum
     return model
 
 
@@ -62,12 +62,12 @@ class _Weigh(torch.autograd.Function):
         return of_probability, of_table, None
 
 
-def correlate(queries: Tensor, table: Tensor, rows: Tensor) -> Tensor:
+def gathered_dot(queries: Tensor, table: Tensor, rows: Tensor) -> Tensor:
     """As `model.sparse_products.correlate`."""
     return _Correlate.apply(queries, table, rows)
 
 
-def weigh(probability: Tensor, table: Tensor, rows: Tensor) -> Tensor:
+def gathered_weighted_sum(probability: Tensor, table: Tensor, rows: Tensor) -> Tensor:
     """As `model.sparse_products.weigh`."""
     return _Weigh.apply(probability, table, rows)
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ...model.common.encoder import Encoded
+from ...model.common.encoder import EncoderFeatures
 from ...model.common.gaussian_adapter import BASE_SIZES
 from ...model.common.layers import repeat_views
 from ...model.config import IDESplatConfig
-from ...model.idesplat.dpbu import Boosted
+from ...model.idesplat.dpbu import DPBUOutput
 
 # Shares of the terms of one stage's loss.
 FIRST_LAYER_SHARE = 0.5
@@ -93,7 +93,7 @@ def entropy_loss(probability: Tensor, candidates: Tensor, truth: Tensor) -> Tens
     return (entropy * inside).sum() / inside.sum().clamp(min=1)
 
 
-def unit_loss(unit: Boosted, scores: tuple[Tensor, Tensor], inverse_depth: Tensor, bins: Tensor) -> Tensor:
+def unit_loss(unit: DPBUOutput, scores: tuple[Tensor, Tensor], inverse_depth: Tensor, bins: Tensor) -> Tensor:
     """Everything that one boosting unit is asked.
 
     scores: what its two layers found by matching alone, each [views * neighbours, candidates, h, w]. They are asked
@@ -111,7 +111,7 @@ def unit_loss(unit: Boosted, scores: tuple[Tensor, Tensor], inverse_depth: Tenso
     return loss
 
 
-def monocular_loss(encoded: Encoded, inverse_depth: Tensor) -> Tensor:
+def monocular_loss(encoded: EncoderFeatures, inverse_depth: Tensor) -> Tensor:
     """The monocular branch knows no scale: both disparities are divided by their mean over all views."""
     disparity = encoded.mono_disparity
     truth = truth_at(inverse_depth, *disparity.shape[2:])

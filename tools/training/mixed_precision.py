@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from ...model.common.backbone import Backbone
 from ...model.common.dinov2 import DinoV2
 from ...model.common.dpt import DPTHead
-from ...model.common.layers import ConvFFN, Merge, Upsample2x
+from ...model.common.layers import ConcatConv1x1, ConvFFN, Upsample2x
 from ...model.common.mv_transformer import MultiViewTransformer
 from ...model.common.photographic_branch import PhotoBranch
 from ...model.common.unet import CostRegulariser
@@ -23,7 +23,7 @@ from ...model.idesplat.network import IDESplat
 
 LOWERED = (
     *(Backbone, MultiViewTransformer, DinoV2, PhotoBranch, CostRegulariser),
-    *(ConvFFN, Merge, Upsample2x, GaussianFocusedModule),
+    *(ConvFFN, ConcatConv1x1, Upsample2x, GaussianFocusedModule),
 )
 # Methods of modules that are not called by `forward`.
 LOWERED_METHODS = {DPTHead: ("features",)}

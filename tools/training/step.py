@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
-from ...model.common.encoder import Encoded
+from ...model.common.encoder import EncoderFeatures
 from ...model.common.geometry import invert_rigid, scale_intrinsics
 from ...model.common.layers import resize
-from ...model.idesplat.dpbu import Boosted, Cameras
+from ...model.idesplat.dpbu import Cameras, DPBUOutput
 from ...model.idesplat.network import IDESplat
 from .losses import Perceptual, coarse_bin, inverse_depth_loss, monocular_loss, offset_loss, render_loss, unit_loss
 from .rasterizer import rasterize
@@ -26,8 +26,8 @@ WITHIN = 0.05
 class Outcome:
     """What the parts that ran say of a scene."""
 
-    encoded: Encoded
-    units: tuple[Boosted, ...]
+    encoded: EncoderFeatures
+    units: tuple[DPBUOutput, ...]
     # The best inverse depth there is, [views, 1, h, w]; h and w are the images' once three units ran.
     inverse_depth: Tensor
     # Where the phase has Gaussians: their raw parameters [views, parameters, H, W], and novel views [targets, 3, H, W].

@@ -6,7 +6,7 @@ import onnx.parser
 import pytest
 import torch
 import torch.nn.functional as F
-from idesplat.export.graph.nodes import sort_nodes
+from idesplat.export.graph.subgraph import sort_nodes
 from idesplat.export.precision.int8 import in_int8
 from idesplat.runtime.inference.session import open_session, run_session
 

@@ -15,7 +15,7 @@ from onnx import TensorProto
 # What is not to lose precision: the geometry, monocular depth, the sparse products, the focused module and the last
 # convolution before the Gaussians.
 EXACT = re.compile(
-    r"/(correlate|weigh)/|/gaussians/(adapter|focus|head2|expand|fuse)|/encoder/(disparity|fusions|laterals)"
+    r"/(gathered_dot|gathered_weighted_sum)/|/gaussians/(adapter|focus|head2|expand|fuse)|/encoder/(disparity|fusions|laterals)"
 )
 
 

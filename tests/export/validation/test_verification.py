@@ -8,9 +8,9 @@ import pytest
 import torch
 from conftest import run_command, small_network
 from idesplat.export import cli
-from idesplat.export.freeze import Fixed
 from idesplat.export.room import room_inputs
 from idesplat.export.stages import NamedTensors, Stage
+from idesplat.export.tracing import StaticShape
 from idesplat.export.validation.cases import Case, verification_cases
 from idesplat.export.validation.compare import FUSED, NEAREST, STAGED, Exported, Figures, TensorError, compare
 from idesplat.export.validation.report import print_details, print_summary
@@ -25,7 +25,7 @@ FAR_END = np.iinfo(np.int64).max
 def cases(exported):
     properties = {entry.key: entry.value for entry in onnx.load(exported[0]).metadata_props}
     description = read_description(properties, exported[0])
-    return list(verification_cases(NamedTensors(small_network()), description, Fixed()))
+    return list(verification_cases(NamedTensors(small_network()), description, StaticShape()))
 
 
 def stages_of(folder):
@@ -317,14 +317,16 @@ def test_the_whole_table_has_every_figure_beside_its_bound(capsys):
 
 @pytest.fixture(scope="module")
 def prepared(small_checkpoint, presets, tmp_path_factory):
-    """The small network's graphs as `freeze` leaves them; tracing takes most of an export."""
-    from idesplat.export.freeze import freeze
+    """The small network's graphs as `export_graphs` leaves them; tracing takes most of an export."""
+    from idesplat.export.tracing import export_graphs
     from idesplat.model.config import PRESETS
 
     folder = tmp_path_factory.mktemp("graphs")
     model = small_network()
     assert model.config in PRESETS.values()
-    return freeze(NamedTensors(model), cli.describe(model, "idesplat-small", "", "", Fixed()), Fixed(), folder)
+    return export_graphs(
+        NamedTensors(model), cli.describe(model, "idesplat-small", "", "", StaticShape()), StaticShape(), folder
+    )
 
 
 @pytest.fixture
@@ -333,7 +335,7 @@ def without_tracing(prepared, monkeypatch):
         shutil.copytree(prepared.folder, folder, dirs_exist_ok=True)
         return type(prepared)(folder, prepared.stages, prepared.nodes)
 
-    monkeypatch.setattr("idesplat.export.freeze.freeze", copy)
+    monkeypatch.setattr("idesplat.export.tracing.export_graphs", copy)
 
 
 @pytest.mark.parametrize(("damaged", "form"), (("model.onnx", FUSED), ("gaussians.onnx", STAGED)))
@@ -343,15 +345,15 @@ def test_the_files_that_are_written_are_those_that_were_verified(
     """A component goes wrong between the traced graphs and one of the files; the graphs themselves are sound."""
     from idesplat.export.graph import external_data as weights
 
-    hand_out = weights.hand_out
+    save_model = weights.save_model
 
-    def hand_out_damaged(graph, out):
-        files = hand_out(graph, out)
+    def save_damaged(graph, out):
+        files = save_model(graph, out)
         if out.name == damaged:
             one_channel(out)
         return files
 
-    monkeypatch.setattr(weights, "hand_out", hand_out_damaged)
+    monkeypatch.setattr(weights, "save_model", save_damaged)
     assert run_command(cli.main, small_checkpoint, tmp_path / "model.onnx", "--staged", tmp_path / "staged") == 1
     assert list(tmp_path.iterdir()) == []
     printed = capsys.readouterr().out
@@ -365,10 +367,10 @@ def test_a_weight_that_hardly_matters_is_compared_too(
     """One weight is off by a rounding step, which no output shows."""
     from idesplat.export.graph import external_data as weights
 
-    hand_out = weights.hand_out
+    save_model = weights.save_model
 
-    def hand_out_damaged(graph, out):
-        files = hand_out(graph, out)
+    def save_damaged(graph, out):
+        files = save_model(graph, out)
         if out.name == damaged:
             model = onnx.load(out)
             tensor = max(model.graph.initializer, key=lambda tensor: len(tensor.raw_data))
@@ -376,7 +378,7 @@ def test_a_weight_that_hardly_matters_is_compared_too(
             onnx.save(model, out)
         return files
 
-    monkeypatch.setattr(weights, "hand_out", hand_out_damaged)
+    monkeypatch.setattr(weights, "save_model", save_damaged)
     assert run_command(cli.main, small_checkpoint, tmp_path / "model.onnx", "--staged", tmp_path / "staged") == 2
     assert list(tmp_path.iterdir()) == []
     assert f"{damaged}: its weights" in capsys.readouterr().err

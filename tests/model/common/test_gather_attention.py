@@ -4,10 +4,10 @@ import numpy as np
 import onnx
 import onnxruntime
 import torch
-from idesplat.export.graph.gather_loops import FEW, in_steps
-from idesplat.export.graph.nodes import names_read
+from idesplat.export.graph.gather_loops import FEW, chunked
+from idesplat.export.graph.subgraph import names_read
 from idesplat.model.common import gather_attention as gathered
-from idesplat.model.common.gather_attention import SparseProducts
+from idesplat.model.common.gather_attention import GatherAttention
 from idesplat.tools.benchmark.matmuls import INPUTS, Both, exported
 from idesplat.tools.training import gather_attention as compiled
 
@@ -20,7 +20,7 @@ def test_values_and_gradients_are_the_networks_own() -> None:
     rows = torch.randint(0, PAIRS * PIXELS + 1, (PAIRS, CANDIDATES, PIXELS))  # the last row is of zeros
     queries, weights = torch.randn(PAIRS, PIXELS, CHANNELS), torch.rand(PAIRS, CANDIDATES, PIXELS)
     table = gathered.pixel_table(torch.randn(PAIRS, PIXELS, CHANNELS))
-    for name, left in (("correlate", queries), ("weigh", weights)):
+    for name, left in (("gathered_dot", queries), ("gathered_weighted_sum", weights)):
         results = []
         for module in (gathered, compiled):
             inputs = [part.clone().requires_grad_() for part in (left, table)]
@@ -57,12 +57,15 @@ def test_exported_values_are_the_networks_own() -> None:
 
 def test_the_networks_own_are_put_back() -> None:
     network = Both(BLOCK)
-    with in_steps(network):
-        assert network.products.correlate is not gathered.correlate
-    assert network.products.correlate is gathered.correlate and network.products.weigh is gathered.weigh
+    with chunked(network):
+        assert network.gather_attention.gathered_dot is not gathered.gathered_dot
+    assert (
+        network.gather_attention.gathered_dot is gathered.gathered_dot
+        and network.gather_attention.gathered_weighted_sum is gathered.gathered_weighted_sum
+    )
 
 
 def test_few_numbers_are_gathered_at_once() -> None:
-    products = SparseProducts(FEW - 1, BLOCK)
-    with in_steps(products):
-        assert products.correlate is gathered.correlate
+    products = GatherAttention(FEW - 1, BLOCK)
+    with chunked(products):
+        assert products.gathered_dot is gathered.gathered_dot

@@ -14,10 +14,10 @@ import pytest
 import torch
 from depthsplat_cases import ONE_SCALE, SMALL
 from idesplat.export.cli import describe
-from idesplat.export.freeze import Fixed, freeze
 from idesplat.export.stages import NamedTensors
+from idesplat.export.tracing import StaticShape, export_graphs
 from idesplat.model.common.cost_volume import by_gathering, by_sampling
-from idesplat.model.common.gather_attention import SparseProducts
+from idesplat.model.common.gather_attention import GatherAttention
 from idesplat.model.common.geometry import Cameras, project_candidates, sampling_points, scale_intrinsics
 from idesplat.model.common.layers import resize
 from idesplat.model.config import PRESETS
@@ -36,7 +36,7 @@ def views(request):
         expected = {name: torch.from_numpy(file[name]) for name in file.files}
     preset, _, size = request.param.stem.rsplit("-", 2)
     config = PRESETS[preset]
-    model = build(replace(config, vit=replace(config.vit, depth=4, taps=(0, 1, 2, 3)))).eval()
+    model = build(replace(config, vit=replace(config.vit, depth=4, out_indices=(0, 1, 2, 3)))).eval()
     seed, gain = expected["seed"].item(), expected["gain"].item()
     shapes = {name: tuple(value.shape) for name, value in model.state_dict().items()}
     drawn = {name: draw_tensor(name, shape, seed, gain).astype(np.float32) for name, shape in shapes.items()}
@@ -73,7 +73,7 @@ def test_depth_of_several_views(views):
 def test_depth_of_several_views_in_onnx_runtime(views, tmp_path):
     """The graph is traced at four views and another size."""
     expected, *_, model, inputs = views
-    graphs = freeze(NamedTensors(model), describe(model, "", "", "", Fixed()), Fixed(), tmp_path)
+    graphs = export_graphs(NamedTensors(model), describe(model, "", "", "", StaticShape()), StaticShape(), tmp_path)
     feeds = {name: value.numpy() for name, value in zip(INPUTS, inputs, strict=True)}
     check_depth(torch.from_numpy(run_session(open_session(graphs.whole), feeds)["depth"]), expected)
 
@@ -127,7 +127,7 @@ def test_depth_only_network_gives_the_same_depth():
         torch.testing.assert_close(alone(*inputs).depth, whole(*inputs).depth)
 
 
-@pytest.mark.parametrize("form", (by_sampling, partial(by_gathering, products=SparseProducts(0, 1))))
+@pytest.mark.parametrize("form", (by_sampling, partial(by_gathering, gather_attention=GatherAttention(0, 1))))
 def test_every_form_of_the_cost_volume_is_grid_sample_then_correlation(form):
     """Borders included, with cameras that turn away and candidates that fall far outside."""
     count, channels, height, width = 4, 6, 9, 13

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 from idesplat.export.cli import describe
-from idesplat.export.freeze import Fixed, freeze
 from idesplat.export.stages import NamedTensors
+from idesplat.export.tracing import StaticShape, export_graphs
 from idesplat.model.checkpoint import fill
 from idesplat.model.common.gaussian_adapter import WorldGaussians
 from idesplat.model.registry import build
@@ -53,8 +53,8 @@ def in_torch(case):
 def in_onnx(case, tmp_path_factory):
     """What ONNX Runtime makes of the same inputs, stage after stage, each reading what those before it yielded."""
     expected, _, model = case
-    description = describe(model, "reference", "drawn", "", Fixed())
-    graphs = freeze(NamedTensors(model), description, Fixed(), tmp_path_factory.mktemp("graphs"))
+    description = describe(model, "reference", "drawn", "", StaticShape())
+    graphs = export_graphs(NamedTensors(model), description, StaticShape(), tmp_path_factory.mktemp("graphs"))
     values = {name: value.numpy() for name, value in expected.items()}
     for stage in graphs.stages:
         values |= run_session(open_session(graphs.of_stage(stage)), values)

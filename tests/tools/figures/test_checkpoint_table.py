@@ -6,7 +6,7 @@ import torch
 from conftest import run_command
 from idesplat.model.config import PRESETS
 from idesplat.model.registry import build
-from idesplat.tools.figures.checkpoint_table import COLUMNS, RELEASED, Measured, draw, main, row
+from idesplat.tools.figures.checkpoint_table import COLUMNS, RELEASED, Measured, main, randomize_weights, row
 
 
 def test_every_released_preset_has_its_row():
@@ -23,8 +23,8 @@ def test_every_released_preset_has_its_row():
 
 def test_drawn_weights_are_always_the_same_and_leave_nothing_at_its_initial_value():
     first, second = build("idesplat-tiny"), build("idesplat-tiny")
-    draw(first)
-    draw(second)
+    randomize_weights(first)
+    randomize_weights(second)
     for (name, parameter), other in zip(first.named_parameters(), second.parameters(), strict=True):
         assert torch.equal(parameter, other), name
         assert parameter.numel() == 1 or parameter.std() > 0, name

@@ -39,7 +39,7 @@ SMALL = IDESplatConfig(
     feature_channels=16,
     transformer_layers=2,
     transformer_ffn_ratio=1,
-    vit=ViTConfig(dim=16, depth=4, heads=2, mlp_ratio=2, grid=5, taps=(0, 1, 2, 3)),
+    vit=ViTConfig(dim=16, depth=4, heads=2, mlp_ratio=2, grid=5, out_indices=(0, 1, 2, 3)),
     dpt=DPTConfig(features=8, channels=(8, 8, 8, 8), disparity_channels=8),
     dpbus=(
         DPBUConfig(channels=16, candidates=17, scale=1, unet=UNetConfig(channels=16, levels=2)),

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import onnx
 
-from ..graph.nodes import sort_nodes
+from ..graph.subgraph import sort_nodes
 from .fp16 import in_fp16
 from .int8 import Feeds, in_int8
 
@@ -24,7 +24,9 @@ CONVOLUTIONS = re.compile(
 SMALL_TENSOR = 1024  # bytes
 
 
-def in_precision(precision: str, graph: onnx.ModelProto, weights: Path, examples: Iterable[Feeds]) -> onnx.ModelProto:
+def convert_precision(
+    precision: str, graph: onnx.ModelProto, weights: Path, examples: Iterable[Feeds]
+) -> onnx.ModelProto:
     """A float32 graph, whose weights are in a file beside which others may be made, in another precision.
 
     examples: inputs on which the ranges of what int8 stands for are found. The file of weights is replaced.
@@ -33,7 +35,7 @@ def in_precision(precision: str, graph: onnx.ModelProto, weights: Path, examples
         return graph
     source = weights.with_name("float32.onnx")
     source.write_bytes(graph.SerializeToString())
-    bearing = [node for node in graph.graph.node if _bears_it(node)]
+    bearing = [node for node in graph.graph.node if is_quantizable(node)]
     if precision == INT8:
         made = in_int8(source, graph, bearing, examples)
     else:
@@ -44,7 +46,7 @@ def in_precision(precision: str, graph: onnx.ModelProto, weights: Path, examples
     return onnx.load(source, load_external_data=False)
 
 
-def _bears_it(node: onnx.NodeProto) -> bool:
+def is_quantizable(node: onnx.NodeProto) -> bool:
     """Whether a node multiplies features."""
     if node.op_type == "MatMul":
         return bool(TRANSFORMERS.match(node.name))

@@ -6,7 +6,7 @@ from graphlib import TopologicalSorter
 import onnx
 
 
-def nodes_between(
+def extract_subgraph(
     traced: onnx.ModelProto, borders: set[str], outputs: Iterable[str]
 ) -> tuple[list[onnx.NodeProto], set[str]]:
     """The nodes on every way back from `outputs` to the first border tensors, in their order, and those tensors."""

@@ -13,9 +13,9 @@ import torch
 from ..runtime.inference.metadata import INPUTS, METADATA_KEY, OUTPUTS, Description
 from .graph.cleanup import simplify
 from .graph.external_data import fill_inputs
-from .graph.gather_loops import explain, in_steps
+from .graph.gather_loops import chunked, lower_custom_ops
+from .precision.convert import convert_precision
 from .precision.int8 import Feeds
-from .precision.parts import in_precision
 from .room import room_inputs
 from .stages import NamedTensors, Stage, example_inputs, find_stages, stage_graph
 
@@ -39,7 +39,7 @@ TRACED, TRACED_WEIGHTS, WEIGHTS, WHOLE = "traced.onnx", "traced.weights", "weigh
 
 
 @dataclass(frozen=True)
-class Fixed:
+class StaticShape:
     """Sizes to bake in; None leaves them to the user of the graph."""
 
     views: int | None = None
@@ -70,10 +70,10 @@ class Graphs:
         return self.folder / f"stage.{stage.name}.onnx"
 
 
-def freeze(network: NamedTensors, description: Description, fixed: Fixed, folder: Path) -> Graphs:
+def export_graphs(network: NamedTensors, description: Description, static: StaticShape, folder: Path) -> Graphs:
     """Trace a network and cut it into stages, all as files in an empty folder, checked against ONNX's specification."""
-    traced = trace(network, description, fixed, folder)
-    traced = in_precision(description.precision, traced, folder / WEIGHTS, _examples(description, fixed))
+    traced = trace(network, description, static, folder)
+    traced = convert_precision(description.precision, traced, folder / WEIGHTS, _examples(description, static))
     whole = _whole_graph(traced)
     graphs = Graphs(folder, find_stages(traced, network.stages), len(whole.graph.node))
     _write(whole, description, graphs.whole)
@@ -82,16 +82,16 @@ def freeze(network: NamedTensors, description: Description, fixed: Fixed, folder
     return graphs
 
 
-def _examples(description: Description, fixed: Fixed) -> Iterator[Feeds]:
+def _examples(description: Description, static: StaticShape) -> Iterator[Feeds]:
     """Noise and a room, upright and across, to see what ranges a network's numbers have."""
     across = tuple(blocks * description.size_multiple for blocks in TRACE_BLOCKS)
-    for height, width in [fixed.size] if fixed.size else [across, across[::-1]]:
+    for height, width in [static.size] if static.size else [across, across[::-1]]:
         for make in (example_inputs, room_inputs):
-            inputs = make(fixed.views or TRACE_VIEWS, height, width, description.near, description.far)
+            inputs = make(static.views or TRACE_VIEWS, height, width, description.near, description.far)
             yield {name: tensor.numpy() for name, tensor in inputs.items()}
 
 
-def trace(network: NamedTensors, description: Description, fixed: Fixed, folder: Path) -> onnx.ModelProto:
+def trace(network: NamedTensors, description: Description, static: StaticShape, folder: Path) -> onnx.ModelProto:
     """Export the network with every stage boundary as an output; its weights go to a file in the folder.
 
     torch.onnx's TorchScript path is used on purpose: with views, height and width dynamic, torch.export 2.13 spends
@@ -99,15 +99,15 @@ def trace(network: NamedTensors, description: Description, fixed: Fixed, folder:
     of which it would hold several copies.
     """
     multiple = description.size_multiple
-    views = fixed.views or TRACE_VIEWS
-    height, width = fixed.size or (TRACE_BLOCKS[0] * multiple, TRACE_BLOCKS[1] * multiple)
+    views = static.views or TRACE_VIEWS
+    height, width = static.size or (TRACE_BLOCKS[0] * multiple, TRACE_BLOCKS[1] * multiple)
     inputs = tuple(example_inputs(views, height, width, description.near, description.far).values())
     path, weights = folder / TRACED, folder / TRACED_WEIGHTS
-    with warnings.catch_warnings(), torch.no_grad(), in_steps(network):
+    with warnings.catch_warnings(), torch.no_grad(), chunked(network):
         warnings.simplefilter("ignore")  # deprecation of the path, and tracing warnings on sizes fixed on purpose
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)
         shapes = {name: tuple(tensor.shape) for name, tensor in network.named(*inputs).items()}
-        axes = _dynamic_axes(shapes, fixed)
+        axes = _dynamic_axes(shapes, static)
         torch.onnx.export(
             network,
             inputs,
@@ -120,7 +120,7 @@ def trace(network: NamedTensors, description: Description, fixed: Fixed, folder:
             output_names=list(shapes),
             dynamic_axes=axes,
         )
-    traced = explain(onnx.load(path))
+    traced = lower_custom_ops(onnx.load(path))
     fill_inputs(traced, [*network.named_parameters(), *network.named_buffers()], weights)
     path.write_bytes(traced.SerializeToString())
     model = simplify(path, folder / WEIGHTS)
@@ -129,7 +129,7 @@ def trace(network: NamedTensors, description: Description, fixed: Fixed, folder:
     return model
 
 
-def _dynamic_axes(shapes: dict[str, tuple[int, ...]], fixed: Fixed) -> dict[str, dict[int, str]]:
+def _dynamic_axes(shapes: dict[str, tuple[int, ...]], static: StaticShape) -> dict[str, dict[int, str]]:
     """Names of the dimensions that are not fixed; the maps between stages have dimensions of their own."""
     boundaries = {
         name: {0: "views", 2: f"{name}.height", 3: f"{name}.width"}
@@ -142,7 +142,7 @@ def _dynamic_axes(shapes: dict[str, tuple[int, ...]], fixed: Fixed) -> dict[str,
     def is_open(dimension: str) -> bool:
         depends_on_views = dimension in ("views", "neighbours", "gaussians")
         depends_on_size = dimension == "gaussians" or not depends_on_views
-        return (depends_on_views and not fixed.views) or (depends_on_size and not fixed.size)
+        return (depends_on_views and not static.views) or (depends_on_size and not static.size)
 
     axes = {**DYNAMIC, **boundaries}
     return {name: {axis: dim for axis, dim in dims.items() if is_open(dim)} for name, dims in axes.items()}
