@@ -1,8 +1,10 @@
 VENV ?= .venv
 PYTHON ?= python3
 BIN := $(VENV)/bin
+# Two processes of one thread each are faster than one of two threads: most tests are too small to share out.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --quiet -n 2 --dist loadfile
 
-.PHONY: setup test check demo weights clean
+.PHONY: setup test quick check docs demo weights clean
 
 setup: $(VENV)/.ready
 
@@ -12,17 +14,25 @@ $(VENV)/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[dev]"
 	mkdir -p .typing/idesplat
-	for part in __init__.py model export runtime tools; do ln -sfn ../../$$part .typing/idesplat/$$part; done
+	for part in *.py py.typed model export runtime tools; do ln -sfn ../../$$part .typing/idesplat/$$part; done
 	touch $@
 
-# Lint, types and tests.
+# Lint, types and every test.
 test: check
-	$(BIN)/python -m pytest --quiet
+	$(PYTEST)
+
+# For the edit loop: the tests that take less than a second each.
+quick: setup
+	$(PYTEST) -m "not slow and not browser and not network"
 
 check: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy -p idesplat.model -p idesplat.export -p idesplat.runtime -p idesplat.tools
+	$(BIN)/mypy -p idesplat
+
+# The documentation, in site/; every warning is an error.
+docs: setup
+	$(BIN)/mkdocs build --strict --quiet --site-dir site
 
 # Photographs of a drawn room to a splat, in demo/.
 demo: setup

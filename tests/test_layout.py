@@ -123,3 +123,8 @@ def test_every_package_is_in_the_wheel() -> None:
 def test_nothing_generic_becomes_importable(tmp_path: Path) -> None:
     code = "import importlib.util as u; assert not any(u.find_spec(n) for n in ('model', 'export', 'runtime', 'tools'))"
     subprocess.run([sys.executable, "-c", code], check=True, cwd=tmp_path, timeout=60)
+
+
+def test_the_citation_names_this_version() -> None:
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
