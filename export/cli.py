@@ -13,7 +13,7 @@ from ..runtime.cli.outputs import Overwrite, guards_outputs, outputs
 from ..runtime.cli.terminal import run, say, warn
 from ..runtime.errors import InputError, exit_on_input_error
 from ..runtime.images.sizes import parse_size, size_fits, size_rule
-from ..runtime.inference.metadata import Description, StageFile, write_manifest
+from ..runtime.inference.metadata import ModelMetadata, StageFile, write_manifest
 from ..runtime.system.files import check_writable, make_folder
 
 if TYPE_CHECKING:
@@ -162,13 +162,13 @@ def _load(checkpoint: Path, preset: str | None) -> "tuple[Network, str, str]":
 
 def describe(
     model: "Network", preset: str, checkpoint: str, digest: str, static: "StaticShape", precision: str = "float32"
-) -> Description:
+) -> ModelMetadata:
     """What an exported network says of itself."""
     from ..model.depthsplat.network import DepthSplatDepth
 
     config = model.config
     height, width = static.size or (config.height, config.width)
-    return Description(
+    return ModelMetadata(
         preset=preset,
         height=height,
         width=width,
@@ -190,7 +190,7 @@ def describe(
 
 def _export(
     model: "Network",
-    description: Description,
+    description: ModelMetadata,
     static: "StaticShape",
     out: Path | None,
     staged: Path | None,
@@ -256,7 +256,7 @@ def _write_stages(graphs: "Graphs", folder: Path) -> "list[tuple[Stage, Path]]":
     return [(stage, folder / file.file) for stage, file in zip(graphs.stages, files, strict=True)]
 
 
-def _say_written(paths: list[Path], model: Path, description: Description) -> None:
+def _say_written(paths: list[Path], model: Path, description: ModelMetadata) -> None:
     """What was written and how to use it."""
     say(*(f"wrote {path}" for path in paths))
     if len(paths) > 1:

@@ -10,7 +10,7 @@ from pathlib import Path
 import onnx
 import torch
 
-from ..runtime.inference.metadata import INPUTS, METADATA_KEY, OUTPUTS, Description
+from ..runtime.inference.metadata import INPUTS, METADATA_KEY, OUTPUTS, ModelMetadata
 from .graph.cleanup import simplify
 from .graph.external_data import fill_inputs
 from .graph.gather_loops import chunked, lower_custom_ops
@@ -70,7 +70,7 @@ class Graphs:
         return self.folder / f"stage.{stage.name}.onnx"
 
 
-def export_graphs(network: NamedTensors, description: Description, static: StaticShape, folder: Path) -> Graphs:
+def export_graphs(network: NamedTensors, description: ModelMetadata, static: StaticShape, folder: Path) -> Graphs:
     """Trace a network and cut it into stages, all as files in an empty folder, checked against ONNX's specification."""
     traced = trace(network, description, static, folder)
     traced = convert_precision(description.precision, traced, folder / WEIGHTS, _examples(description, static))
@@ -82,7 +82,7 @@ def export_graphs(network: NamedTensors, description: Description, static: Stati
     return graphs
 
 
-def _examples(description: Description, static: StaticShape) -> Iterator[Feeds]:
+def _examples(description: ModelMetadata, static: StaticShape) -> Iterator[Feeds]:
     """Noise and a room, upright and across, to see what ranges a network's numbers have."""
     across = tuple(blocks * description.size_multiple for blocks in TRACE_BLOCKS)
     for height, width in [static.size] if static.size else [across, across[::-1]]:
@@ -91,7 +91,7 @@ def _examples(description: Description, static: StaticShape) -> Iterator[Feeds]:
             yield {name: tensor.numpy() for name, tensor in inputs.items()}
 
 
-def trace(network: NamedTensors, description: Description, static: StaticShape, folder: Path) -> onnx.ModelProto:
+def trace(network: NamedTensors, description: ModelMetadata, static: StaticShape, folder: Path) -> onnx.ModelProto:
     """Export the network with every stage boundary as an output; its weights go to a file in the folder.
 
     torch.onnx's TorchScript path is used on purpose: with views, height and width dynamic, torch.export 2.13 spends
@@ -166,7 +166,7 @@ def _whole_graph(traced: onnx.ModelProto) -> onnx.ModelProto:
     return model
 
 
-def _write(model: onnx.ModelProto, description: Description, path: Path) -> None:
+def _write(model: onnx.ModelProto, description: ModelMetadata, path: Path) -> None:
     """Have a graph say what it is, and save it."""
     model.ir_version = IR_VERSION
     model.producer_name, model.producer_version = PRODUCER, description.version

@@ -3,6 +3,7 @@
 The names below load their module when first used, so that importing the package costs nothing.
 """
 
+import warnings
 from importlib import import_module
 from typing import TYPE_CHECKING
 
@@ -12,45 +13,57 @@ if TYPE_CHECKING:
     from .cameras.camera import Camera
     from .cameras.io import read_cameras
     from .errors import InputError
-    from .inference.predictor import Prediction, Runner
+    from .inference.bundled_model import bundled_model
+    from .inference.metadata import ModelMetadata
+    from .inference.predictor import Prediction, Predictor
     from .rendering.rasterizer import rasterize
+    from .rendering.render import render
     from .splats.formats.ply import read_ply, write_ply
     from .splats.gaussians import Gaussians
-    from .splats.io import read_offset, read_scene, write_scene
+    from .splats.io import read_offset, read_splats, write_splats
 
 _MODULE_OF = {
     "Camera": "cameras.camera",
     "Gaussians": "splats.gaussians",
     "InputError": "errors",
+    "ModelMetadata": "inference.metadata",
     "Prediction": "inference.predictor",
-    "Runner": "inference.predictor",
+    "Predictor": "inference.predictor",
+    "bundled_model": "inference.bundled_model",
     "rasterize": "rendering.rasterizer",
     "read_cameras": "cameras.io",
     "read_offset": "splats.io",
     "read_ply": "splats.formats.ply",
-    "read_scene": "splats.io",
+    "read_splats": "splats.io",
+    "render": "rendering.render",
     "write_ply": "splats.formats.ply",
-    "write_scene": "splats.io",
+    "write_splats": "splats.io",
 }
 
 __all__ = [
     "Camera",
     "Gaussians",
     "InputError",
+    "ModelMetadata",
     "Prediction",
-    "Runner",
+    "Predictor",
+    "bundled_model",
     "rasterize",
     "read_cameras",
     "read_offset",
     "read_ply",
-    "read_scene",
+    "read_splats",
+    "render",
     "write_ply",
-    "write_scene",
+    "write_splats",
 ]
 
 
 def __getattr__(name: str) -> object:
     """Load a public name from its module, once."""
+    if name == "Runner":
+        warnings.warn("Runner is now called Predictor", DeprecationWarning, stacklevel=2)
+        name = "Predictor"
     if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(f".{_MODULE_OF[name]}", __name__), name)

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...runtime.inference.metadata import Description
+from ...runtime.inference.metadata import ModelMetadata
 from ..room import room_inputs, with_room
 from ..stages import NamedTensors, example_inputs
 from ..tracing import StaticShape
@@ -35,7 +35,7 @@ class Case:
     tensors: dict[str, np.ndarray]
 
 
-def verification_cases(network: NamedTensors, description: Description, static: StaticShape) -> Iterator[Case]:
+def verification_cases(network: NamedTensors, description: ModelMetadata, static: StaticShape) -> Iterator[Case]:
     """Cases of different numbers of views, sizes and contents, as far as views and size are not fixed."""
     near, far, block = description.near, description.far, description.size_multiple
     trained = static.size or (description.height, description.width)

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...model.idesplat.network import IDESplat
-from ...runtime.inference.metadata import INPUTS, OUTPUTS, Description
+from ...runtime.inference.metadata import INPUTS, OUTPUTS, ModelMetadata
 from ...runtime.inference.session import open_session, run_session
 from ..precision.convert import FLOAT32
 from ..stages import NamedTensors, Stage
@@ -114,7 +114,7 @@ class Exported:
 
 
 def verify(
-    network: NamedTensors, exported: Exported, description: Description, static: StaticShape
+    network: NamedTensors, exported: Exported, description: ModelMetadata, static: StaticShape
 ) -> Iterator[TensorError]:
     """Compare the graph of every stage with the network, and everything that is handed out, end to end."""
     cases = list(verification_cases(network, description, static))

@@ -23,20 +23,20 @@ def convert(
     .ply, .compressed.ply, .splat, .spz, .sog and .glb are read and written; .points.ply, .points.glb, .obj and .xyz are
     written as points. What a format cannot hold is named.
     """
-    from ..splats.io import read_offset, read_scene, scene_suffix, write_scene
+    from ..splats.io import read_offset, read_splats, splat_suffix, write_splats
 
-    scene_suffix(out)
+    splat_suffix(out)
     outputs().reads("the scene", [scene])
     outputs().writes("", [out])
     if not 0 <= min_opacity <= 1:
         raise InputError(f"--min-opacity {min_opacity:g}: expected a number from 0 to 1")
-    gaussians = read_scene(scene)
+    gaussians = read_splats(scene)
     if min_opacity:
-        whole, gaussians = len(gaussians), gaussians.taken(gaussians.opacities >= min_opacity)
+        whole, gaussians = len(gaussians), gaussians.select(gaussians.opacities >= min_opacity)
         if not len(gaussians):
             raise InputError(f"--min-opacity {min_opacity:g}: no Gaussian is left of {whole}; use a smaller one")
         say(f"cleaned: {whole - len(gaussians):,} too faint; {len(gaussians):,} Gaussians left")
-    for note in write_scene(out, gaussians, read_offset(scene)):
+    for note in write_splats(out, gaussians, read_offset(scene)):
         say(f"note: {note}")
     say(f"wrote {out}: {len(gaussians):,} Gaussians, {out.stat().st_size / 1e6:.1f} MB")
 

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
     from ..cameras.camera import Camera
     from ..inference.inputs import Inputs, Request
-    from ..inference.predictor import Prediction, Runner
-    from ..splats.filtering import Cleaning
+    from ..inference.predictor import Prediction, Predictor
+    from ..splats.filtering import FilterOptions
     from ..views.batch import Views
     from ..views.depth_range import DepthRange
 
@@ -95,17 +95,17 @@ def infer(
     ] = None,
     render: Annotated[Path | None, typer.Option(help="Folder for views drawn from the result.")] = None,
     min_opacity: Annotated[float, typer.Option(help="Leave out fainter Gaussians.", rich_help_panel=CLEANING)] = 0,
-    trim_border: Annotated[
+    crop_border: Annotated[
         int, typer.Option(help="Leave out this many pixels along every picture's edges.", rich_help_panel=CLEANING)
     ] = 0,
-    trim_edges: Annotated[
+    max_depth_jump: Annotated[
         float,
         typer.Option(
             help="Leave out pixels whose depth differs from a neighbour's by more than this share, such as 0.05.",
             rich_help_panel=CLEANING,
         ),
     ] = 0,
-    min_confidence: Annotated[
+    min_consistency: Annotated[
         float,
         typer.Option(
             help="Leave out pixels whose depth a smaller share of the other views confirms, such as 0.5.",
@@ -138,10 +138,10 @@ def infer(
 ) -> None:
     """Turn posed photographs into a 3D Gaussian splat that every viewer opens."""
     from ..cameras.io import write_cameras
-    from ..inference.bundled_model import default_model
+    from ..inference.bundled_model import bundled_model
     from ..inference.inputs import Request, read_inputs
-    from ..inference.predictor import Runner
-    from ..splats.filtering import Cleaning
+    from ..inference.predictor import Predictor
+    from ..splats.filtering import FilterOptions
     from ..splats.io import holds_splats, is_surface
     from ..system.progress import working
 
@@ -149,30 +149,30 @@ def infer(
     given = Request([*(images or []), *(more_images or [])], cameras, camera_format, focal, frames, views, size)
     if cameras == ESTIMATE and save_cameras is None:
         save_cameras = _beside(out, ESTIMATED_CAMERAS)
-    model = model or default_model()
+    model = model or bundled_model()
     files = {"--out": out, "--json": json_path, "--save-cameras": save_cameras, "--report": report}
     _announce(given, model, files, {"--save-depth": save_depth, "--render": render})
     _check_range(near, far)
     _check_offset(offset)
-    cleaning = Cleaning(min_opacity, trim_border, trim_edges, min_confidence, merge_duplicates)
+    cleaning = FilterOptions(min_opacity, crop_border, max_depth_jump, min_consistency, merge_duplicates)
     with working("loading the model"):
-        runner = Runner(model, provider)
-    _check_fit(runner, out, cleaning, {"--render": render, "--report": report})
-    _check_depth_format(depth_format, save_depth, runner)
+        predictor = Predictor(model, provider)
+    _check_fit(predictor, out, cleaning, {"--render": render, "--report": report})
+    _check_depth_format(depth_format, save_depth, predictor)
     preparing = time.perf_counter()
-    inputs = read_inputs(given, runner)
+    inputs = read_inputs(given, predictor)
     prepared = inputs.views
-    if not runner.description.gaussians and save_depth is None:  # depth maps are what such a model is for
+    if not predictor.metadata.gaussians and save_depth is None:  # depth maps are what such a model is for
         save_depth = _beside(out, DEPTH_FOLDER)
     _announce_pictures(given, inputs, save_depth, depth_format, render)
     with working("finding near and far"):
-        span = runner.depth_range(prepared, near, far)
+        span = predictor.depth_range(prepared, near, far)
     prepared, place_notes = _place(prepared, offset, span)
     predicting = time.perf_counter()
-    prediction = _predict(prepared, runner, span)
+    prediction = _predict(prepared, predictor, span)
     writing = time.perf_counter()
     cleaned: dict[str, int] = {}
-    if cleaning.asked and not is_surface(out):
+    if cleaning.enabled and not is_surface(out):
         prediction, cleaned = _clean(prediction, prepared, cleaning)
     _write_scene(prediction, prepared, out, cleaning)
     pictures = _write_pictures(prediction, prepared, save_depth, depth_format, render)
@@ -181,9 +181,9 @@ def infer(
         found = inputs.cameras
         write_cameras(save_cameras, _named_from(save_cameras.parent, found) if cameras == ESTIMATE else found)
         written.append(save_cameras)
-    seconds = {"load": runner.load_seconds, "prepare": predicting - preparing, **prediction.seconds}
+    seconds = {"load": predictor.load_seconds, "prepare": predicting - preparing, **prediction.seconds}
     seconds |= {"write": time.perf_counter() - writing, "total": time.perf_counter() - started}
-    summary = _summary(prediction, inputs, cameras, runner, span, seconds, [*written, *pictures])
+    summary = _summary(prediction, inputs, cameras, predictor, span, seconds, [*written, *pictures])
     summary |= {"offset": prepared.offset.tolist(), "notes": [*inputs.notes, *place_notes]}
     summary["cleaned"] = {"asked": asdict(cleaning), "left_out": cleaned}
     if report is not None:
@@ -248,9 +248,9 @@ def _say_how_to_look(out: Path, given: "Request", save_cameras: Path | None) -> 
 
 def _beside(out: Path, ending: str) -> Path:
     """A path beside the scene, called like it but for the ending."""
-    from ..splats.io import scene_suffix
+    from ..splats.io import splat_suffix
 
-    return out.with_name(out.name[: -len(scene_suffix(out))] + ending)
+    return out.with_name(out.name[: -len(splat_suffix(out))] + ending)
 
 
 def _announce(
@@ -260,7 +260,7 @@ def _announce(
 
     files, folders: what is to be written, by option.
     """
-    from ..splats.io import scene_suffix
+    from ..splats.io import splat_suffix
     from .input_files import camera_files, given_images, model_files
 
     run = outputs()
@@ -269,7 +269,7 @@ def _announce(
     if given.cameras != ESTIMATE:
         run.reads("the cameras", camera_files(Path(given.cameras)))
     if files["--out"] is not None:
-        scene_suffix(files["--out"])
+        splat_suffix(files["--out"])
     for option, path in files.items():
         if path is not None and not (option == "--json" and path == STANDARD_OUTPUT):
             run.writes(option, [path])
@@ -333,27 +333,27 @@ def _described(out: Path, prediction: "Prediction", seconds: dict[str, float]) -
     return f": {count}{out.stat().st_size / 1e6:.1f} MB, in {seconds['total']:.1f} s"
 
 
-def _check_fit(runner: "Runner", out: Path, cleaning: "Cleaning", drawn: dict[str, Path | None]) -> None:
+def _check_fit(predictor: "Predictor", out: Path, cleaning: "FilterOptions", drawn: dict[str, Path | None]) -> None:
     """Find out before the work whether the model makes what is asked for.
 
     Of a model that predicts depth alone, a name that may stand for splats or points stands for points.
     """
-    from ..splats.io import MESHES, holds_splats, is_surface, scene_suffix
+    from ..splats.io import MESHES, holds_splats, is_surface, splat_suffix
     from ..splats.points import POINT_SUFFIXES
 
-    splats = holds_splats(out) and scene_suffix(out) not in POINT_SUFFIXES
+    splats = holds_splats(out) and splat_suffix(out) not in POINT_SUFFIXES
     needs = [f"--out {out}"] * splats + [option for option, path in drawn.items() if path is not None]
     if not is_surface(out):
-        needs += [f"--{step.replace('_', '-')}" for step in cleaning.asked]
-    if needs and not runner.description.gaussians:
+        needs += [f"--{step.replace('_', '-')}" for step in cleaning.enabled]
+    if needs and not predictor.metadata.gaussians:
         endings = ", ".join((*POINT_SUFFIXES, *MESHES))
-        raise InputError(f"{needs[0]}: {runner.path} predicts depth alone; write points or a surface ({endings})")
-    if is_surface(out) and set(cleaning.asked) - {"trim_edges"}:
-        raise InputError(f"--out {out}: of all cleaning a surface knows --trim-edges alone; leave out the rest")
+        raise InputError(f"{needs[0]}: {predictor.path} predicts depth alone; write points or a surface ({endings})")
+    if is_surface(out) and set(cleaning.enabled) - {"max_depth_jump"}:
+        raise InputError(f"--out {out}: of all cleaning a surface knows --max-depth-jump alone; leave out the rest")
 
 
-def _check_depth_format(depth_format: DepthFormat | None, save_depth: Path | None, runner: "Runner") -> None:
-    if depth_format is not None and save_depth is None and runner.description.gaussians:
+def _check_depth_format(depth_format: DepthFormat | None, save_depth: Path | None, predictor: "Predictor") -> None:
+    if depth_format is not None and save_depth is None and predictor.metadata.gaussians:
         raise InputError(f"--depth-format {depth_format}: give --save-depth, the folder to write to")
 
 
@@ -380,38 +380,38 @@ def _place(views: "Views", offset: str | None, span: "DepthRange") -> "tuple[Vie
     return with_offset(views, offset, span.near)
 
 
-def _predict(views: "Views", runner: "Runner", span: "DepthRange") -> "Prediction":
+def _predict(views: "Views", predictor: "Predictor", span: "DepthRange") -> "Prediction":
     from ..system.progress import working
 
     with working("predicting depth and Gaussians"):
-        return runner.predict_views(views, span.near, span.far)
+        return predictor.predict_views(views, span.near, span.far)
 
 
-def _clean(prediction: "Prediction", views: "Views", cleaning: "Cleaning") -> "tuple[Prediction, dict[str, int]]":
+def _clean(prediction: "Prediction", views: "Views", cleaning: "FilterOptions") -> "tuple[Prediction, dict[str, int]]":
     """The prediction without what is to be left out, and how much that was."""
-    from ..splats.filtering import clean, describe
+    from ..splats.filtering import describe_removed, filter_gaussians
 
     whole = prediction.need_gaussians()
-    gaussians, taken = clean(whole, prediction.depth, views.extrinsics, views.intrinsics, cleaning)
-    say(describe(taken, len(gaussians)))
+    gaussians, taken = filter_gaussians(whole, prediction.depth, views.extrinsics, views.intrinsics, cleaning)
+    say(describe_removed(taken, len(gaussians)))
     return replace(prediction, gaussians=gaussians), taken
 
 
-def _write_scene(prediction: "Prediction", views: "Views", out: Path, cleaning: "Cleaning") -> None:
+def _write_scene(prediction: "Prediction", views: "Views", out: Path, cleaning: "FilterOptions") -> None:
     """Write the splats, points or surface that the file's name asks for."""
-    from ..splats.io import is_surface, lost_offset, write_scene
+    from ..splats.io import is_surface, lost_offset, write_splats
     from ..splats.mesh import LARGEST_JUMP, faces_from_depth
     from ..splats.points import points_from_depth, write_mesh, write_point_cloud
 
     if not is_surface(out) and prediction.gaussians is not None:
-        for note in write_scene(out, prediction.gaussians, views.offset):
+        for note in write_splats(out, prediction.gaussians, views.offset):
             say(f"note: {note}")
         return
     for note in lost_offset(views.offset):
         say(f"note: {note}")
     points = points_from_depth(prediction.depth, views.images, views.extrinsics, views.intrinsics)
     if is_surface(out):
-        write_mesh(out, points, faces_from_depth(prediction.depth, cleaning.trim_edges or LARGEST_JUMP))
+        write_mesh(out, points, faces_from_depth(prediction.depth, cleaning.max_depth_jump or LARGEST_JUMP))
     else:
         write_point_cloud(out, points)
 
@@ -450,7 +450,7 @@ def _write_renders(prediction: "Prediction", views: "Views", stems: list[str], f
 
     from ..geometry.trajectories import interpolate_extrinsics
     from ..images.writing import save_png
-    from ..rendering.render_view import draw_view
+    from ..rendering.render import render_view
     from ..system.progress import progress
 
     gaussians = prediction.need_gaussians()
@@ -461,7 +461,7 @@ def _write_renders(prediction: "Prediction", views: "Views", stems: list[str], f
     shots += [(name, pose, K.mean(axis=0)) for name, pose in zip(_path_names(), path, strict=True)]
     written = []
     for name, pose, k in progress(shots, "drawing views"):
-        save_png(folder / name, draw_view(gaussians, pose, k, width, height).rgb)
+        save_png(folder / name, render_view(gaussians, pose, k, width, height).rgb)
         written.append(folder / name)
     return written
 
@@ -470,16 +470,16 @@ def _summary(
     prediction: "Prediction",
     inputs: "Inputs",
     cameras: str,
-    runner: "Runner",
+    predictor: "Predictor",
     span: "DepthRange",
     seconds: dict[str, float],
     written: list[Path],
 ) -> dict[str, Any]:
     import numpy as np
 
-    own, depth = runner.description, prediction.depth
+    own, depth = predictor.metadata, prediction.depth
     return {
-        "model": {"path": str(runner.path), **asdict(own)},
+        "model": {"path": str(predictor.path), **asdict(own)},
         "cameras": cameras,
         "views": inputs.views.names,
         "notes": inputs.notes,

@@ -13,7 +13,7 @@ from ..cameras.io import CameraFormat, read_cameras
 from ..errors import InputError, exit_on_input_error
 from ..images.sizes import parse_size
 from ..images.video_writer import check_video_support, open_video
-from ..images.writing import depth_colours, depth_ends, save_png
+from ..images.writing import depth_colours, inverse_depth_range, save_png
 from ..rendering.cameras import (
     FULL_TURN,
     MOST_FRAMES,
@@ -26,10 +26,10 @@ from ..rendering.cameras import (
     frame_names,
     overview,
 )
-from ..rendering.render_view import draw_view
+from ..rendering.render import render_view
 from ..rendering.types import Rendering
 from ..splats.gaussians import Gaussians
-from ..splats.io import read_offset, read_scene
+from ..splats.io import read_offset, read_splats
 from ..system.files import replacing
 from ..system.progress import progress
 from .input_files import camera_files, named_images, nearby_images
@@ -90,7 +90,7 @@ def render(
     names = frame_names(frames) if path or orbit else [view.name for view in views] or [STILL]
     stems = _stems(names, out, kinds)
     _announce(scene, cameras, views, stems, out, kinds)
-    gaussians = read_scene(scene)
+    gaussians = read_splats(scene)
     views = relative_cameras(views, read_offset(scene))
     shots = _shots(gaussians, views, orbit, path, degrees, frames, size)
     check_shots(shots)
@@ -189,7 +189,7 @@ def _shots(
 
 def _drawer(gaussians: Gaussians, background: tuple[float, float, float]) -> Callable[[Camera], Rendering]:
     def draw(shot: Camera) -> Rendering:
-        return draw_view(gaussians, shot.extrinsics, shot.K, shot.width, shot.height, background)
+        return render_view(gaussians, shot.extrinsics, shot.K, shot.width, shot.height, background)
 
     return draw
 
@@ -205,15 +205,15 @@ def _film(
                 f"--out {out}: {shot.name} has {shot.width}x{shot.height} pixels, {shots[0].name} {width}x{height}, "
                 "and a video has one size; add --size"
             )
-    ends: tuple[float, float] | None = None  # the first frame's, so that colours mean the same in all
+    limits: tuple[float, float] | None = None  # the first frame's, so that colours mean the same in all
     with ExitStack() as stack:
         films = {kind: _film_path(out, kind) for kind in kinds}
         add = {kind: stack.enter_context(open_video(film, width, height, fps)) for kind, film in films.items()}
         for shot in progress(shots, "drawing"):
             drawn = draw(shot)
-            ends = ends or depth_ends(_depth(drawn))
+            limits = limits or inverse_depth_range(_depth(drawn))
             for kind in kinds:
-                add[kind](_picture(drawn, kind, ends))
+                add[kind](_picture(drawn, kind, limits))
     return list(films.values())
 
 
@@ -241,10 +241,10 @@ def _depth(drawn: Rendering) -> np.ndarray:
     return np.where(drawn.alpha >= SOLID, drawn.depth / np.maximum(drawn.alpha, SOLID), 0).astype(np.float32)
 
 
-def _picture(drawn: Rendering, kind: str, ends: tuple[float, float] | None = None) -> np.ndarray:
+def _picture(drawn: Rendering, kind: str, limits: tuple[float, float] | None = None) -> np.ndarray:
     """One kind of picture of a rendering, RGB in [0, 1], [height, width, 3]."""
     if kind == DEPTH:
-        return depth_colours(_depth(drawn), ends)
+        return depth_colours(_depth(drawn), limits)
     return np.repeat(drawn.alpha[..., None], 3, axis=2) if kind == ALPHA else drawn.rgb
 
 

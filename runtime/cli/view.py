@@ -47,13 +47,13 @@ def view(
     With --images only the cameras of these photographs are drawn. A click at a camera leads there (not in an .html).
     Nothing is fetched from the network.
     """
-    from ..splats.io import read_scene
+    from ..splats.io import read_splats
 
     if images and cameras is None:
         raise InputError("--images: needs the cameras that took them; give --cameras")
     if html is not None:
         _check_page(html, scene, cameras, [*(images or []), *(more_images or [])])
-    gaussians = read_scene(scene)
+    gaussians = read_splats(scene)
     viewpoints = read_viewpoints(cameras, camera_format, [*(images or []), *(more_images or [])])
     viewpoints = _relative(viewpoints, scene)
     if html is None:

@@ -29,28 +29,28 @@ def save_depth_png(path: Path, depth: np.ndarray) -> None:
     save_png(path, depth_colours(depth))
 
 
-def depth_colours(depth: np.ndarray, ends: tuple[float, float] | None = None) -> np.ndarray:
-    """Depth in world units, [height, width], as RGB in [0, 1] from blue (far) to red (near), by inverse depth.
+def depth_colours(depth: np.ndarray, limits: tuple[float, float] | None = None) -> np.ndarray:
+    """Depth in world units, [height, width], as RGB in [0, 1] from blue (far) to red (near), linear in inverse depth.
 
-    ends: the inverse depths that are quite blue and quite red; the map's own `depth_ends` if not given. What lies
-    beyond has their colours. Depth that is not positive and finite becomes black.
+    limits: vmin and vmax, the inverse depths at the blue and the red end of the colour map; the map's own
+    `inverse_depth_range` by default. Values beyond them are clipped. Depth that is not positive and finite is black.
     """
     import cv2
 
     known = _known(depth)
     inverse_depth = 1 / np.where(known, depth, 1)
-    far, near = depth_ends(depth) if ends is None else ends
-    warmth = (inverse_depth - far) / (near - far) if near > far else np.full(depth.shape, 0.5)
-    picture = cv2.applyColorMap(to_bytes(warmth), cv2.COLORMAP_TURBO)
+    vmin, vmax = inverse_depth_range(depth) if limits is None else limits
+    t = (inverse_depth - vmin) / (vmax - vmin) if vmax > vmin else np.full(depth.shape, 0.5)
+    picture = cv2.applyColorMap(to_bytes(t), cv2.COLORMAP_TURBO)
     picture[~known] = 0
     return picture[..., ::-1].astype(np.float32) / 255
 
 
-def depth_ends(depth: np.ndarray) -> tuple[float, float]:
-    """Inverse depths, of the far and the near end, beyond which 2 % of a depth map lie each."""
+def inverse_depth_range(depth: np.ndarray) -> tuple[float, float]:
+    """vmin and vmax of a depth map's colours: the 2nd and the 98th percentile of its inverse depth."""
     known = _known(depth)
-    far, near = np.percentile(1 / depth[known], (FARTHEST_SHARE, NEAREST_SHARE)) if known.any() else (0.0, 1.0)
-    return float(far), float(near)
+    vmin, vmax = np.percentile(1 / depth[known], (FARTHEST_SHARE, NEAREST_SHARE)) if known.any() else (0.0, 1.0)
+    return float(vmin), float(vmax)
 
 
 def _known(depth: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ FOLDER = Path(__file__).with_name("bundled")
 CHECKSUM_SUFFIX = ".sha256"
 
 
-def default_model() -> Path:
+def bundled_model() -> Path:
     """The carried model's path; raises InputError if the file is not the one that was carried."""
     path = FOLDER / NAME
     remedy = "install idesplat again, or give --model"

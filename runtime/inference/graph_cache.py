@@ -36,13 +36,13 @@ Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
-class Place:
+class CacheEntry:
     """Where one model's optimised graph is kept, for this processor and this ONNX Runtime."""
 
     folder: Path
     key: str
 
-    def find(self) -> Path | None:
+    def get(self) -> Path | None:
         """The optimised graph, if it is there and intact; what is there and is not, is removed."""
         for path in self.folder.glob(f"{self.key}.*{SUFFIX}"):
             with suppress(OSError):
@@ -52,7 +52,7 @@ class Place:
                 path.unlink()
         return None
 
-    def fill(self, make: Callable[[Path], Result]) -> Result:
+    def put(self, make: Callable[[Path], Result]) -> Result:
         """Have `make` write the optimised graph to a path, keep it whole or not at all, and return what `make` does.
 
         Raises OSError where the folder cannot be written, and what `make` raises.
@@ -64,7 +64,7 @@ class Place:
         _shrink(self.folder, path)
         return result
 
-    def forget(self, path: Path) -> None:
+    def evict(self, path: Path) -> None:
         """Remove an entry that is intact and of no use."""
         with suppress(OSError):
             path.unlink()
@@ -77,7 +77,7 @@ class Place:
         return f"{self.key}.{digest.hexdigest()}{SUFFIX}"
 
 
-def place_for(model: Path) -> Place | None:
+def cache_entry(model: Path) -> CacheEntry | None:
     """Where the optimised graph of a model file belongs; None where it is not to be, or cannot be, kept."""
     try:
         if not _is_regular(model) or model.stat().st_size > LARGEST_MODEL:
@@ -93,7 +93,7 @@ def place_for(model: Path) -> Place | None:
     made_for = [LAYOUT, onnxruntime.__version__, onnxruntime.get_build_info(), _processor()]
     digest = hashlib.sha256(json.dumps(made_for).encode())
     digest.update(content)
-    return Place(folder, digest.hexdigest()[:KEY_LENGTH])
+    return CacheEntry(folder, digest.hexdigest()[:KEY_LENGTH])
 
 
 def _is_regular(path: Path) -> bool:

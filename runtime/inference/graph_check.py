@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..system.files import open_regular
-from .metadata import INPUTS, OUTPUTS, Description
+from .metadata import INPUTS, OUTPUTS, ModelMetadata
 from .metadata_fields import shown
 
 FLOAT = "tensor(float)"
@@ -78,7 +78,7 @@ def _check_location(path: Path, location: str) -> None:
         raise InputError(f"{path}: keeps weights in {shown(location)}, which is no file; move it along with the graph")
 
 
-def check_fused(path: Path, graph: Graph, own: Description) -> None:
+def check_fused(path: Path, graph: Graph, own: ModelMetadata) -> None:
     """Raise InputError unless the one graph takes the network's inputs and yields what the description promises."""
     inputs, outputs = ({value.name: value for value in part} for part in (graph.get_inputs(), graph.get_outputs()))
     unknown = [name for name in inputs if name not in INPUTS]
@@ -91,7 +91,7 @@ def check_fused(path: Path, graph: Graph, own: Description) -> None:
 
 
 def check_stage(
-    path: Path, graph: Graph, reads: Sequence[str], yields: Sequence[str], own: Description, known: dict[str, str]
+    path: Path, graph: Graph, reads: Sequence[str], yields: Sequence[str], own: ModelMetadata, known: dict[str, str]
 ) -> None:
     """Raise InputError unless a staged folder's graph reads and yields what the manifest says.
 
@@ -109,12 +109,12 @@ def check_stage(
     _check_values(path, inputs, outputs, own)
 
 
-def promised(own: Description) -> Sequence[str]:
+def promised(own: ModelMetadata) -> Sequence[str]:
     """What a model yields in the end."""
     return OUTPUTS if own.gaussians else OUTPUTS[:1]
 
 
-def check_results(values: Mapping[str, object], views: int, height: int, width: int, own: Description) -> None:
+def check_results(values: Mapping[str, object], views: int, height: int, width: int, own: ModelMetadata) -> None:
     """Raise InputError unless the results have the shapes and ranges that `Prediction` promises."""
     count, coefficients = views * height * width, (own.sh_degree + 1) ** 2
     shapes: dict[str, tuple[int, ...]] = {
@@ -140,7 +140,7 @@ def check_results(values: Mapping[str, object], views: int, height: int, width: 
     _check_signs(values, own)
 
 
-def _check_signs(values: Mapping[str, object], own: Description) -> None:
+def _check_signs(values: Mapping[str, object], own: ModelMetadata) -> None:
     """Depth is positive, and so are scales; opacities are shares."""
     ranges = {"depth": (np.nextafter(np.float32(0), 1), np.inf), "scales": (0, np.inf), "opacities": (0, 1)}
     for name, (low, high) in ranges.items():
@@ -152,7 +152,7 @@ def _check_signs(values: Mapping[str, object], own: Description) -> None:
             )
 
 
-def _check_values(path: Path, inputs: Mapping[str, Value], outputs: Mapping[str, Value], own: Description) -> None:
+def _check_values(path: Path, inputs: Mapping[str, Value], outputs: Mapping[str, Value], own: ModelMetadata) -> None:
     """Types and shapes of the network's own inputs and outputs; those between stages may be of any kind."""
     views = own.fixed_views or None
     height, width = (own.height, own.width) if own.fixed_size else (None, None)

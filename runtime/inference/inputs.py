@@ -20,7 +20,7 @@ from ..views.batch import Views, match, prepare
 from ..views.loader import Pair
 from ..views.selection import FEWEST_VIEWS
 from ..views.sources import find_photographs
-from .predictor import Runner
+from .predictor import Predictor
 
 DEFAULT_VIEWS = 2
 # What --frames takes beside names and numbers: 0-3 is 0, 1, 2, 3; 0:8:2 is 0, 2, 4, 6, as Python has it.
@@ -56,7 +56,7 @@ class Inputs:
     notes: list[str]
 
 
-def read_inputs(request: Request, runner: Runner) -> Inputs:
+def read_inputs(request: Request, predictor: Predictor) -> Inputs:
     """Read photographs and cameras, or estimate these, choose the views and bring them to the model's size.
 
     Raises InputError for whatever cannot be used.
@@ -70,7 +70,7 @@ def read_inputs(request: Request, runner: Runner) -> Inputs:
             from ..sfm.estimate import estimate_cameras
 
             images = pick_frames(images, request.frames)
-            wanted = _wanted(request, runner, images)
+            wanted = _wanted(request, predictor, images)
             left_out: list[str] = []
             cameras = estimate_cameras(images, request.focal, None if request.frames else left_out, decoded)
             notes += left_out
@@ -80,21 +80,21 @@ def read_inputs(request: Request, runner: Runner) -> Inputs:
             with working("reading cameras"):
                 cameras = read_cameras(given, images, request.camera_format)
             images = pick_frames(images, request.frames)
-            wanted = _wanted(request, runner, images)
+            wanted = _wanted(request, predictor, images)
         pairs = match(images, cameras)
         if request.frames is None and len(cameras) > len(pairs):
             notes.append(f"{len(cameras) - len(pairs)} of {len(cameras)} cameras have no photograph among those given")
         own = [camera if path.parent != folder else replace(camera, name=path.name) for path, camera in pairs]
-        height, width = parse_size(request.size) if request.size else runner.size_for(own)
+        height, width = parse_size(request.size) if request.size else predictor.size_for(own)
         count = min(wanted or len(pairs), len(pairs))
-        runner.check_size(max(count, FEWEST_VIEWS), height, width)
+        predictor.check_size(max(count, FEWEST_VIEWS), height, width)
         with working("choosing and reading photographs"):
             read: list[Pair] = [(decoded.get(path, path), camera) for path, camera in pairs]
             views = prepare(read, count, height, width, leave_out_damaged=request.frames is None)
     notes += [f"{line}; left out" for line in views.left_out]
     if request.views and request.views > len(pairs):
         notes.append(f"--views {request.views}: all {len(pairs)} photographs used; there are no more with a camera")
-    notes += _cut(views.cameras[0], height, width, runner)
+    notes += _cut(views.cameras[0], height, width, predictor)
     if views.choice:
         notes.append(
             f"{count} of {len(pairs)} photographs used: {', '.join(views.names)}; {views.choice} "
@@ -140,18 +140,18 @@ def _numbers(word: str, count: int) -> Sequence[int]:
     return numbers if numbers and numbers[-1] < count else []
 
 
-def _wanted(request: Request, runner: Runner, picked: Sequence[Path]) -> int | None:
+def _wanted(request: Request, predictor: Predictor, picked: Sequence[Path]) -> int | None:
     """How many views to use of the images that --frames names; None for all."""
-    return runner.view_count(request.views, len(picked) if request.frames else None, DEFAULT_VIEWS)
+    return predictor.view_count(request.views, len(picked) if request.frames else None, DEFAULT_VIEWS)
 
 
-def _cut(camera: Camera, height: int, width: int, runner: Runner) -> list[str]:
+def _cut(camera: Camera, height: int, width: int, predictor: Predictor) -> list[str]:
     """A line that tells of the part of the photographs that is cut off, where that is much, and of a size without."""
     crop = cover(camera.width, camera.height, width, height)
     share = width * height / (crop.width * crop.height)
     if share >= MUCH:
         return []
-    own = runner.description
+    own = predictor.metadata
     whole = nearest_size(camera.height / camera.width, own.height * own.width, own.size_multiple)
     remedy = "" if own.fixed_size else f"; --size {whole[0]}x{whole[1]} takes in nearly all"
     return [f"the middle {height}x{width} of each photograph is used, {100 * share:.0f} % of it{remedy}"]

@@ -29,7 +29,7 @@ CONVENTIONS = (
 
 
 @dataclass(frozen=True)
-class Description:
+class ModelMetadata:
     """How a model is to be fed and what it yields."""
 
     preset: str
@@ -97,7 +97,7 @@ _ADDED_LATER = frozenset({"gaussians", "precision", "conventions"})
 _STAGE: dict[str, Check] = {"name": string, "file": string, "inputs": names, "outputs": names}
 
 
-def read_description(properties: dict[str, str], path: Path) -> Description:
+def read_metadata(properties: dict[str, str], path: Path) -> ModelMetadata:
     """The description in a model's metadata properties; raises InputError if it is none of ours, or damaged."""
     if METADATA_KEY not in properties:
         lack = f"not a model of this project (no '{METADATA_KEY}' metadata)"
@@ -111,14 +111,14 @@ def read_description(properties: dict[str, str], path: Path) -> Description:
         if isinstance(layout, bool) or layout != LAYOUT:
             found = f"metadata layout {shown(layout)}, expected {LAYOUT}"
             raise InputError(f"{found}; export it again with this version")
-        description = Description(**checked_fields(content, _DESCRIPTION, _ADDED_LATER))
+        description = ModelMetadata(**checked_fields(content, _DESCRIPTION, _ADDED_LATER))
         _check_description(description)
     except InputError as error:
         raise InputError(f"{path}: damaged metadata: {error}; export it again") from None
     return description
 
 
-def _check_description(own: Description) -> None:
+def _check_description(own: ModelMetadata) -> None:
     """What the fields must be together."""
     if not own.near < own.far:
         raise InputError(f"near {own.near:g} and far {own.far:g}, expected near < far")

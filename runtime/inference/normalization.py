@@ -8,7 +8,7 @@ from ..splats.gaussians import Gaussians
 
 
 @dataclass(frozen=True, eq=False)
-class SceneFrame:
+class SceneNormalization:
     """The user's world, moved to the middle of the cameras and scaled so that near is what it was in training.
 
     The networks are not indifferent to the unit: they read inverse depths as numbers and predict the size of splats in
@@ -21,21 +21,21 @@ class SceneFrame:
     scale: float
 
     @classmethod
-    def of(cls, extrinsics: np.ndarray, near: np.ndarray, trained_near: float) -> "SceneFrame":
+    def of(cls, extrinsics: np.ndarray, near: np.ndarray, trained_near: float) -> "SceneNormalization":
         """The frame for cameras [views, 4, 4] with these nearest depths [views]."""
         return cls(extrinsics[:, :3, 3].mean(axis=0, dtype=np.float64), float(trained_near / np.min(near)))
 
-    def enter(self, extrinsics: np.ndarray) -> np.ndarray:
+    def apply(self, extrinsics: np.ndarray) -> np.ndarray:
         """Camera-to-world poses [views, 4, 4] of the user's world in this one, float32."""
         entered = np.array(extrinsics, np.float64)
         entered[:, :3, 3] = (entered[:, :3, 3] - self.origin) * self.scale
         return entered.astype(np.float32)
 
-    def leave_depth(self, depth: np.ndarray) -> np.ndarray:
+    def invert_depth(self, depth: np.ndarray) -> np.ndarray:
         """Depth in the user's unit, float32."""
         return (depth / np.float64(self.scale)).astype(np.float32)
 
-    def leave(self, gaussians: Gaussians) -> Gaussians:
+    def invert(self, gaussians: Gaussians) -> Gaussians:
         """Gaussians in the user's world and unit."""
         scale = np.float64(self.scale)
         means = (gaussians.means / scale + self.origin).astype(np.float32)

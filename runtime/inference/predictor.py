@@ -15,9 +15,9 @@ from ..splats.gaussians import Gaussians
 from ..views.batch import Views, check_views, prepare
 from ..views.depth_range import DepthRange, find_depth_range
 from .graph_check import check_file, check_fused, check_results, check_stage, promised
-from .metadata import INPUTS, Description, StageFile, read_description, read_manifest
-from .normalization import SceneFrame
-from .session import CPU, USUAL, Tuning, open_session, provider_name, run_limit_s, run_session
+from .metadata import INPUTS, ModelMetadata, StageFile, read_manifest, read_metadata
+from .normalization import SceneNormalization
+from .session import CPU, DEFAULT, SessionConfig, open_session, provider_name, run_limit_s, run_session
 
 FUSED = "model"
 
@@ -26,7 +26,7 @@ FUSED = "model"
 class Prediction:
     """depth: metric z-depth in scene units, float32 [views, height, width].
 
-    gaussians: ordered by view, row, column; None from a depth-only model (`Runner.description.gaussians` is false).
+    gaussians: ordered by view, row, column; None from a depth-only model (`Predictor.metadata.gaussians` is false).
     cameras: the views' cameras at the size of the depth maps, [views]: K in pixels of these, pixel centres at .5, poses
     camera-to-world with OpenCV axes, no distortion, `depth_range` near and far. With them, depth leads back to points.
     """
@@ -44,16 +44,16 @@ class Prediction:
         return self.gaussians
 
 
-class Runner:
+class Predictor:
     """An exported model, ready to run.
 
     model: a `.onnx` of this project, or a folder that `idesplat-export --staged` wrote.
     provider: an ONNX Runtime execution provider, such as CPU or CUDA.
-    tuning: threads and profiling, for those who measure.
+    config: threads and profiling, for those who measure.
     Raises InputError if the model is not ours or damaged, or the provider is not there.
     """
 
-    def __init__(self, model: Path | str, provider: str = CPU, tuning: Tuning = USUAL) -> None:
+    def __init__(self, model: Path | str, provider: str = CPU, config: SessionConfig = DEFAULT) -> None:
         self.path = Path(model)
         if not self.path.exists():
             raise InputError(f"{self.path}: no such model; give a .onnx file or staged folder made by idesplat-export")
@@ -64,12 +64,12 @@ class Runner:
             check_file(folder / stage.file)
         started = time.perf_counter()
         self._stages = [
-            (stage, open_session(folder / stage.file, provider, _profiled(tuning, stage))) for stage in stages
+            (stage, open_session(folder / stage.file, provider, _profiled(config, stage))) for stage in stages
         ]
         self.load_seconds = time.perf_counter() - started
         try:
             properties = self._stages[0][1].get_modelmeta().custom_metadata_map
-            self.description: Description = read_description(properties, self.path)
+            self.metadata: ModelMetadata = read_metadata(properties, self.path)
             self._check_graphs(folder)
         except UnicodeDecodeError:
             raise InputError(f"{self.path}: damaged: its metadata or names are not UTF-8; export it again") from None
@@ -114,7 +114,7 @@ class Runner:
 
         Raises InputError if near is not before far.
         """
-        trained = self.description.near, self.description.far
+        trained = self.metadata.near, self.metadata.far
         return find_depth_range(
             views.images, views.extrinsics, views.intrinsics, views.cameras, trained, near, far, views.samples
         )
@@ -134,7 +134,7 @@ class Runner:
         near, far: in the unit of the poses, one number or one for each view. What is not given is found, from points
         matched between the views or from their baseline, as `depth_range` does. It is never the range of the model's
         training, which is of no meaning in another unit.
-        The network itself works in a frame and unit of its own (`SceneFrame`): a scene in any unit gives the same
+        The network works in a normalised frame and unit (`SceneNormalization`): a scene in any unit gives the same
         result, in that unit.
         Raises InputError for anything the model cannot take.
         """
@@ -142,7 +142,7 @@ class Runner:
         self.check_size(len(images), *np.shape(images)[2:])
         arrays = np.asarray(images), np.asarray(extrinsics), np.asarray(intrinsics)
         if near is None or far is None:
-            trained = self.description.near, self.description.far
+            trained = self.metadata.near, self.metadata.far
             nearest = None if near is None else float(np.min(near))
             farthest = None if far is None else float(np.max(far))
             span = find_depth_range(*arrays, (), trained, near=nearest, far=farthest)
@@ -163,10 +163,10 @@ class Runner:
         views, _, height, width = images.shape
         self.check_size(views, height, width)
         nearest, farthest = (np.full(views, depth, np.float64) for depth in (near, far))
-        frame = SceneFrame.of(extrinsics, nearest, self.description.near)
+        frame = SceneNormalization.of(extrinsics, nearest, self.metadata.near)
         values = {
             "images": np.ascontiguousarray(images, np.float32),
-            "extrinsics": frame.enter(extrinsics),
+            "extrinsics": frame.apply(extrinsics),
             "intrinsics": np.ascontiguousarray(intrinsics, np.float32),
             "near": (nearest * frame.scale).astype(np.float32),
             "far": (farthest * frame.scale).astype(np.float32),
@@ -182,24 +182,24 @@ class Runner:
     def _check_graphs(self, folder: Path) -> None:
         """Raise InputError unless the graphs are what metadata and manifest say of them."""
         if not self.path.is_dir():
-            (stage, session), outputs = self._stages[0], list(promised(self.description))
-            check_fused(self.path, session, self.description)
+            (stage, session), outputs = self._stages[0], list(promised(self.metadata))
+            check_fused(self.path, session, self.metadata)
             self._stages = [(replace(stage, inputs=list(INPUTS), outputs=outputs), session)]
             return
         types: dict[str, str] = {}
         for stage, session in self._stages:
-            check_stage(folder / stage.file, session, stage.inputs, stage.outputs, self.description, types)
-        missing = [name for name in promised(self.description) if name not in types]
+            check_stage(folder / stage.file, session, stage.inputs, stage.outputs, self.metadata, types)
+        missing = [name for name in promised(self.metadata) if name not in types]
         if missing:
             raise InputError(f"{self.path}: no stage yields {missing[0]}; export it again")
 
     def end_profiling(self) -> list[Path]:
-        """Stop noting operators, where `tuning.profile` asked for it; the files of notes, one for each stage."""
+        """Stop noting operators, where `config.profile` asked for it; the files of notes, one for each stage."""
         return [Path(session.end_profiling()) for _, session in self._stages]
 
     def size_for(self, cameras: Sequence[Camera]) -> tuple[int, int]:
         """The trained height and width, turned upright where most pictures are and the model leaves the choice."""
-        own = self.description
+        own = self.metadata
         upright = sum(camera.height > camera.width for camera in cameras) * 2 > len(cameras)
         turn = upright and own.width > own.height and not own.fixed_size
         return (own.width, own.height) if turn else (own.height, own.width)
@@ -211,7 +211,7 @@ class Runner:
         any number.
         Raises InputError where the model was exported for a number of views, and another is asked for.
         """
-        fixed = self.description.fixed_views
+        fixed = self.metadata.fixed_views
         if not fixed:
             return asked or (None if named else default)
         if asked is not None and asked != fixed:
@@ -222,11 +222,11 @@ class Runner:
         return fixed
 
     def _fixed(self) -> str:
-        return f"{self.path} was exported for {self.description.fixed_views} views"
+        return f"{self.path} was exported for {self.metadata.fixed_views} views"
 
     def check_size(self, views: int, height: int, width: int) -> None:
         """Raise InputError unless the model takes this many views of this size."""
-        own = self.description
+        own = self.metadata
         if own.fixed_views and views != own.fixed_views:
             raise InputError(f"{self._fixed()} and got {views}; give {own.fixed_views}, or export without --views")
         if own.fixed_size and (height, width) != (own.height, own.width):
@@ -238,7 +238,7 @@ class Runner:
             rule = size_rule(own.size_multiple)
             raise InputError(f"{self.path}: cannot take images of {height}x{width}; {rule}")
 
-    def _run(self, values: dict[str, np.ndarray], frame: SceneFrame) -> Prediction:
+    def _run(self, values: dict[str, np.ndarray], frame: SceneNormalization) -> Prediction:
         seconds = {}
         views, _, height, width = values["images"].shape
         limit_s = run_limit_s(views * height * width)
@@ -249,19 +249,19 @@ class Runner:
             seconds[stage.name] = time.perf_counter() - started
             values = {name: value for name, value in values.items() if name in keep}
         with located(str(self.path)):
-            check_results(values, views, height, width, self.description)
+            check_results(values, views, height, width, self.metadata)
         gaussians = None
-        if self.description.gaussians:
+        if self.metadata.gaussians:
             parts = (values[name] for name in ("means", "scales", "quats", "opacities", "sh"))
-            gaussians = frame.leave(Gaussians(*parts))
-        return Prediction(frame.leave_depth(values["depth"]), gaussians, seconds)
+            gaussians = frame.invert(Gaussians(*parts))
+        return Prediction(frame.invert_depth(values["depth"]), gaussians, seconds)
 
 
-def _profiled(tuning: Tuning, stage: StageFile) -> Tuning:
-    """`tuning` with a file of notes of the stage's own."""
-    if tuning.profile is None:
-        return tuning
-    return replace(tuning, profile=tuning.profile.with_name(f"{tuning.profile.name}-{stage.name}"))
+def _profiled(config: SessionConfig, stage: StageFile) -> SessionConfig:
+    """`config` with a file of notes of the stage's own."""
+    if config.profile is None:
+        return config
+    return replace(config, profile=config.profile.with_name(f"{config.profile.name}-{stage.name}"))
 
 
 def _last_uses(stages: list[StageFile]) -> list[set[str]]:

@@ -15,7 +15,7 @@ import onnxruntime
 from ..errors import InputError
 from ..system.files import check_regular
 from . import openvino
-from .graph_cache import place_for
+from .graph_cache import cache_entry
 
 CPU = "CPUExecutionProvider"
 # Errors reach the caller as exceptions; ONNX Runtime's own log would print them to the terminal a second time.
@@ -51,7 +51,7 @@ def provider_name(provider: str) -> str:
 
 
 @dataclass(frozen=True)
-class Tuning:
+class SessionConfig:
     """How sessions are opened, for those who measure; everyone else does best with the defaults."""
 
     # None: as many as the process may use.
@@ -62,10 +62,12 @@ class Tuning:
     optimise: bool = True
 
 
-USUAL = Tuning()
+DEFAULT = SessionConfig()
 
 
-def open_session(model: Path | bytes, provider: str = CPU, tuning: Tuning = USUAL) -> onnxruntime.InferenceSession:
+def open_session(
+    model: Path | bytes, provider: str = CPU, config: SessionConfig = DEFAULT
+) -> onnxruntime.InferenceSession:
     """Load a graph on one execution provider, given by its full name, as `provider_name` gives it.
 
     On the CPU a file's optimised graph is kept for the next time (see `graph_cache`).
@@ -75,10 +77,10 @@ def open_session(model: Path | bytes, provider: str = CPU, tuning: Tuning = USUA
     if isinstance(model, Path):
         with suppress(OSError):  # ONNX Runtime says that there is no such file
             check_regular(model)
-    options = _options(tuning)
+    options = _options(config)
     if provider == openvino.PROVIDER:
         openvino.add_openvino(options)
-    if provider == CPU and isinstance(model, Path) and tuning.optimise:
+    if provider == CPU and isinstance(model, Path) and config.optimise:
         cached = _open_cached(model, options)
         if cached is not None:
             return cached
@@ -104,7 +106,7 @@ def usable_cores() -> int:
     return os.cpu_count() or 1
 
 
-def _options(tuning: Tuning) -> onnxruntime.SessionOptions:
+def _options(config: SessionConfig) -> onnxruntime.SessionOptions:
     options = onnxruntime.SessionOptions()
     options.log_severity_level = FATAL_ONLY
     # Its planning is quadratic in the number of nodes: without it a session opens ten times faster, and a run takes
@@ -115,10 +117,10 @@ def _options(tuning: Tuning) -> onnxruntime.SessionOptions:
     options.enable_mem_pattern = False
     # Left alone, ONNX Runtime 1.31 pins a thread to every core, also to those that the process was told to keep off.
     restricted = usable_cores() < (os.cpu_count() or 1)
-    options.intra_op_num_threads = tuning.threads or (usable_cores() if restricted else AS_MANY_AS_CORES)
-    if tuning.profile is not None:
-        options.enable_profiling, options.profile_file_prefix = True, str(tuning.profile)
-    if not tuning.optimise:
+    options.intra_op_num_threads = config.threads or (usable_cores() if restricted else AS_MANY_AS_CORES)
+    if config.profile is not None:
+        options.enable_profiling, options.profile_file_prefix = True, str(config.profile)
+    if not config.optimise:
         options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
         options.add_session_config_entry("session.disable_prepacking", "1")  # else a profile misses weights' shapes
     return options
@@ -136,23 +138,23 @@ def _create(
 
 def _open_cached(model: Path, options: onnxruntime.SessionOptions) -> onnxruntime.InferenceSession | None:
     """A session of the optimised graph, which is kept if it was not yet; None where that does not work out."""
-    place = place_for(model)
-    if place is None:
+    entry = cache_entry(model)
+    if entry is None:
         return None
 
     def optimise(kept: Path) -> onnxruntime.InferenceSession:
         options.optimized_model_filepath = str(kept)
         return _create(model, options)
 
-    found = place.find()
+    found = entry.get()
     try:
         if found is None:
-            return place.fill(optimise)
+            return entry.put(optimise)
         options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
         return _create(found, options)
     except Exception:  # a damaged model, a full disk: opening the model itself says what is wrong, if anything is
         if found is not None:
-            place.forget(found)
+            entry.evict(found)
         return None
     finally:
         options.optimized_model_filepath = ""

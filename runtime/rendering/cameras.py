@@ -12,7 +12,7 @@ from ..cameras.camera import Camera
 from ..errors import InputError
 from ..geometry.trajectories import interpolate_extrinsics, orbit_extrinsics
 from ..splats.gaussians import Gaussians
-from .render_view import draw_view
+from .render import render_view
 
 FIELD_OF_VIEW = math.radians(60)  # of the shorter side, where no camera is given
 DOWN = (0.0, 1.0, 0.0)  # likewise: the y axis of most splat files
@@ -83,7 +83,7 @@ def focus(gaussians: Gaussians, camera: Camera) -> float:
     """
     factor = FOCUS_SIDE / max(camera.width, camera.height)
     small = fitted(camera, max(round(camera.height * factor), 1), max(round(camera.width * factor), 1))
-    drawn = draw_view(gaussians, small.extrinsics, small.K, small.width, small.height)
+    drawn = render_view(gaussians, small.extrinsics, small.K, small.width, small.height)
     seen = drawn.alpha >= FOCUS_ALPHA
     if not seen.any():
         raise InputError(f"the camera {camera.name} sees nothing of the scene; give the cameras that belong to it")

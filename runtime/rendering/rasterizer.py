@@ -66,7 +66,7 @@ def rasterize(
         starts = range(0, max(len(gaussians.means), 1), PROJECTED_AT_ONCE)
         blocks = pool.map(lambda start: project(gaussians, start, camera), starts)
         splats = Splats(*map(np.concatenate, zip(*blocks, strict=True)))
-        splats = splats.taken(_nearest_first(splats.paint[:, 3]))
+        splats = splats.select(_nearest_first(splats.paint[:, 3]))
 
         def draw(top: int) -> None:
             sums[top : top + band_rows] = composite_band(splats, top, min(band_rows, height - top), width)

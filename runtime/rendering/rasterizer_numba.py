@@ -12,8 +12,8 @@ import numpy as np
 
 from ..geometry.sh import SH_0, SH_1, SH_2, SH_3
 from .types import (
-    DILATION,
-    FIELD_OF_VIEW_MARGIN,
+    EPS2D,
+    FOV_MARGIN,
     MAX_ALPHA,
     MIN_ALPHA,
     MIN_LOG_TRANSMITTANCE,
@@ -41,7 +41,7 @@ def project(scene: Scene, start: int, view: View) -> Splats:
     _project(*block, *view, ellipses, spans, paint)
     splats = Splats._make([*ellipses, *spans, paint])
     touching = (splats.rows > 0) & (splats.columns > 0)
-    return splats if touching.all() else splats.taken(np.flatnonzero(touching))
+    return splats if touching.all() else splats.select(np.flatnonzero(touching))
 
 
 def composite_band(splats: Splats, top: int, rows: int, width: int) -> np.ndarray:
@@ -69,7 +69,7 @@ def _project(
 ) -> None:
     """Fill the fields of `Splats`; a Gaussian that is not seen gets no rows."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    margin_x, margin_y = FIELD_OF_VIEW_MARGIN * 0.5 * width / fx, FIELD_OF_VIEW_MARGIN * 0.5 * height / fy
+    margin_x, margin_y = FOV_MARGIN * 0.5 * width / fx, FOV_MARGIN * 0.5 * height / fy
     position = np.empty(3)
     for axis in range(3):
         position[axis] = -np.sum(viewmat[:3, axis] * viewmat[:3, 3])
@@ -99,11 +99,11 @@ def _project(
             xx += half_x * half_x
             xy += half_x * half_y
             yy += half_y * half_y
-        x_variance, y_variance = xx + DILATION, yy + DILATION
+        x_variance, y_variance = xx + EPS2D, yy + EPS2D
         shear = xy / y_variance
         reach = np.log(np.float64(opacities[index] / LOWEST_ALPHA))
         ellipses[0, index], ellipses[1, index], ellipses[2, index] = x, y, shear
-        ellipses[3, index] = max(x_variance - shear * shear * y_variance, DILATION)
+        ellipses[3, index] = max(x_variance - shear * shear * y_variance, EPS2D)
         ellipses[4, index], ellipses[5, index] = y_variance, reach
         spans[0, index], spans[1, index] = _span(y, np.sqrt(2 * reach * y_variance), height)
         _, spans[2, index] = _span(x, np.sqrt(2 * reach * x_variance), width)

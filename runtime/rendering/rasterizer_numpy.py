@@ -9,8 +9,8 @@ import numpy as np
 from ..geometry.quaternions import rotation_matrices
 from ..geometry.sh import sh_basis
 from .types import (
-    DILATION,
-    FIELD_OF_VIEW_MARGIN,
+    EPS2D,
+    FOV_MARGIN,
     MAX_ALPHA,
     MIN_ALPHA,
     MIN_LOG_TRANSMITTANCE,
@@ -30,7 +30,7 @@ def project(gaussians: Scene, start: int, camera: View) -> Splats:
 
     splats = _ellipses(points, block, camera)
     touching = _where((splats.rows > 0) & (splats.columns > 0))
-    splats = splats.taken(touching)
+    splats = splats.select(touching)
     splats.paint[:, :3] = _colours(block.means[touching], block.sh[touching], camera.viewmat)
     splats.paint[:, 3] = points[touching, 2]
     return splats
@@ -53,7 +53,7 @@ def _ellipses(points: np.ndarray, gaussians: Scene, camera: View) -> Splats:
     x, y = fx * across + cx, fy * down + cy
 
     # Far outside the image the linearisation would blow splats up, so its direction stays near the field of view.
-    margin_x, margin_y = FIELD_OF_VIEW_MARGIN * 0.5 * width / fx, FIELD_OF_VIEW_MARGIN * 0.5 * height / fy
+    margin_x, margin_y = FOV_MARGIN * 0.5 * width / fx, FOV_MARGIN * 0.5 * height / fy
     across = np.clip(across, -cx / fx - margin_x, (width - cx) / fx + margin_x)
     down = np.clip(down, -cy / fy - margin_y, (height - cy) / fy + margin_y)
     to_camera = camera.viewmat[:3, :3]
@@ -62,11 +62,11 @@ def _ellipses(points: np.ndarray, gaussians: Scene, camera: View) -> Splats:
     axes = rotation_matrices(gaussians.quats) * gaussians.scales[:, None, :]  # [splats, 3, 3], as columns, scaled
     half_x = np.einsum("ni,nij->nj", jacobian_x, axes)
     half_y = np.einsum("ni,nij->nj", jacobian_y, axes)
-    x_variance = np.einsum("ni,ni->n", half_x, half_x) + DILATION
-    y_variance = np.einsum("ni,ni->n", half_y, half_y) + DILATION
+    x_variance = np.einsum("ni,ni->n", half_x, half_x) + EPS2D
+    y_variance = np.einsum("ni,ni->n", half_y, half_y) + EPS2D
     shear = np.einsum("ni,ni->n", half_x, half_y) / y_variance
     # Never below the dilation in exact arithmetic; the difference of two large numbers may be.
-    row_variance = np.maximum(x_variance - shear * shear * y_variance, DILATION)
+    row_variance = np.maximum(x_variance - shear * shear * y_variance, EPS2D)
 
     reach = np.log(gaussians.opacities / MIN_ALPHA, dtype=np.float64)
     first_row, rows = _span(y, np.sqrt(2 * reach * y_variance), height)
@@ -94,7 +94,7 @@ def _colours(means: np.ndarray, sh: np.ndarray, viewmat: np.ndarray) -> np.ndarr
 def composite_band(splats: Splats, top: int, rows: int, width: int) -> np.ndarray:
     """Sums [rows, width, 5] of red, green, blue, depth and alpha over the image rows from `top` on."""
     last_row = splats.first_row + splats.rows
-    splats = splats.taken(np.flatnonzero((splats.first_row < top + rows) & (last_row > top)))
+    splats = splats.select(np.flatnonzero((splats.first_row < top + rows) & (last_row > top)))
     first_row = np.maximum(splats.first_row, top)
     last_row = np.minimum(splats.first_row + splats.rows, top + rows)
     splats = splats._replace(y=splats.y - top, first_row=first_row - top, rows=last_row - first_row)
@@ -118,7 +118,7 @@ def _chunks(splats: Splats) -> Iterator[Splats]:
     while start < len(most_fragments):
         stop = int(np.searchsorted(most_fragments, spent + FRAGMENTS_AT_ONCE, side="right"))
         stop = max(stop, start + 1)
-        yield splats.taken(slice(start, stop))
+        yield splats.select(slice(start, stop))
         start, spent = stop, int(most_fragments[stop - 1])
 
 

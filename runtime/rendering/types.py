@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-DILATION = 0.3  # px^2, added to the projected covariance: no splat is thinner than a pixel
-FIELD_OF_VIEW_MARGIN = 0.3  # share of the half image by which the Jacobian's direction may leave the image
+EPS2D = 0.3  # px^2, added to the projected covariance: no splat is thinner than a pixel
+FOV_MARGIN = 0.3  # share of the half image by which the Jacobian's direction may leave the image
 MIN_ALPHA = 1 / 255  # a fragment below it is not drawn
 MAX_ALPHA = 0.99
 # Light left below which nothing further is drawn. Two fragments at MAX_ALPHA reach 1e-4 itself; the slack keeps the
@@ -65,7 +65,7 @@ class Splats(NamedTuple):
     columns: np.ndarray  # int64, width of the box around the ellipse
     paint: np.ndarray  # [splats, 4] float32: red, green, blue, depth
 
-    def taken(self, index: np.ndarray | slice) -> "Splats":
+    def select(self, index: np.ndarray | slice) -> "Splats":
         """These splats only, in this order."""
         if isinstance(index, slice):
             return Splats(*(field[index] for field in self))

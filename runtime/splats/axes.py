@@ -12,7 +12,7 @@ GLTF = (-1, -1, 1)  # x left, y up, z forward, as .glb has it
 ODD_IN = ("", "y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
 
 
-def half_turned(gaussians: Gaussians, signs: tuple[int, int, int]) -> Gaussians:
+def convert_axes(gaussians: Gaussians, signs: tuple[int, int, int]) -> Gaussians:
     """The same Gaussians seen in another frame: means, rotations and spherical harmonics turned."""
     sign = dict(zip("xyz", signs, strict=True))
     odd = [np.prod([sign[axis] for axis in axes]) for axes in ODD_IN[: gaussians.sh.shape[1]]]

@@ -15,41 +15,41 @@ from .merging import duplicates, merged
 
 
 @dataclass(frozen=True)
-class Cleaning:
+class FilterOptions:
     """What to leave out; nothing by default.
 
     min_opacity: Gaussians less opaque than this, 0 to 1.
-    trim_border: this many pixels along the edges of every picture, where networks see the least.
-    trim_edges: pixels whose depth differs from a neighbour's by more than this share of it: at the edges of objects,
-        where depth maps put points between foreground and background. 0 for none.
-    min_confidence: pixels of which a smaller share of the other views than this, 0 to 1, confirms the depth; see
+    crop_border: this many pixels along the edges of every image, where networks see the least.
+    max_depth_jump: pixels whose depth differs from a neighbour's by more than this share of it: at the edges of
+        objects, where depth maps put points between foreground and background. 0 for none.
+    min_consistency: pixels of which a smaller share of the other views than this, 0 to 1, confirms the depth; see
         `consistency.confidence`.
     merge_duplicates: make one Gaussian of those that different views put at the same place of the same surface.
     """
 
     min_opacity: float = 0.0
-    trim_border: int = 0
-    trim_edges: float = 0.0
-    min_confidence: float = 0.0
+    crop_border: int = 0
+    max_depth_jump: float = 0.0
+    min_consistency: float = 0.0
     merge_duplicates: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("min_opacity", "min_confidence"):
+        for name in ("min_opacity", "min_consistency"):
             if not 0 <= getattr(self, name) <= 1:
                 raise InputError(f"{_option(name)} {getattr(self, name):g}: expected a number from 0 to 1")
-        if self.trim_border < 0:
-            raise InputError(f"--trim-border {self.trim_border}: expected a number of pixels, 0 or more")
-        if not 0 <= self.trim_edges < np.inf:
-            raise InputError(f"--trim-edges {self.trim_edges:g}: expected a share of the depth, such as 0.05")
+        if self.crop_border < 0:
+            raise InputError(f"--crop-border {self.crop_border}: expected a number of pixels, 0 or more")
+        if not 0 <= self.max_depth_jump < np.inf:
+            raise InputError(f"--max-depth-jump {self.max_depth_jump:g}: expected a share of the depth, such as 0.05")
 
     @property
-    def asked(self) -> list[str]:
+    def enabled(self) -> list[str]:
         """Names of the steps to take, in order."""
         return [field.name for field in fields(self) if getattr(self, field.name)]
 
 
-def clean(
-    gaussians: Gaussians, depth: np.ndarray, extrinsics: np.ndarray, intrinsics: np.ndarray, cleaning: Cleaning
+def filter_gaussians(
+    gaussians: Gaussians, depth: np.ndarray, extrinsics: np.ndarray, intrinsics: np.ndarray, cleaning: FilterOptions
 ) -> tuple[Gaussians, dict[str, int]]:
     """What is left of the Gaussians, and how many each step took, by the names of the steps asked for.
 
@@ -59,17 +59,17 @@ def clean(
     """
     means = gaussians.means.reshape(*depth.shape, 3)
     kept, taken = np.ones(depth.shape, bool), {}
-    for step in cleaning.asked:
+    for step in cleaning.enabled:
         before = int(kept.sum())
         match step:
             case "min_opacity":
                 kept &= gaussians.opacities.reshape(depth.shape) >= cleaning.min_opacity
-            case "trim_border":
-                kept &= _inner(depth.shape[1:], cleaning.trim_border)
-            case "trim_edges":
-                kept &= depth_jumps(depth) <= cleaning.trim_edges
-            case "min_confidence":
-                kept &= confidence(means, depth, extrinsics, intrinsics) >= cleaning.min_confidence
+            case "crop_border":
+                kept &= _inner(depth.shape[1:], cleaning.crop_border)
+            case "max_depth_jump":
+                kept &= depth_jumps(depth) <= cleaning.max_depth_jump
+            case "min_consistency":
+                kept &= confidence(means, depth, extrinsics, intrinsics) >= cleaning.min_consistency
             case "merge_duplicates":
                 same_as = duplicates(means, depth, kept, extrinsics, intrinsics)
                 gaussians = merged(gaussians, same_as)
@@ -77,16 +77,16 @@ def clean(
         taken[step] = before - int(kept.sum())
     if not kept.any():
         raise InputError(f"{', '.join(map(_option, taken))}: no Gaussian is left of {kept.size}; ask for less cleaning")
-    return gaussians.taken(kept.ravel()), taken
+    return gaussians.select(kept.ravel()), taken
 
 
-def describe(taken: dict[str, int], left: int) -> str:
-    """The counts of `clean` in a line."""
+def describe_removed(taken: dict[str, int], left: int) -> str:
+    """The counts of `filter_gaussians` in a line."""
     words = {
         "min_opacity": "too faint",
-        "trim_border": "at borders",
-        "trim_edges": "at depth edges",
-        "min_confidence": "not confirmed by other views",
+        "crop_border": "at borders",
+        "max_depth_jump": "at depth edges",
+        "min_consistency": "not confirmed by other views",
         "merge_duplicates": "merged into another view's",
     }
     return f"cleaned: {', '.join(f'{taken[step]:,} {words[step]}' for step in taken)}; {left:,} Gaussians left"
@@ -99,7 +99,7 @@ def _option(step: str) -> str:
 def _inner(shape: tuple[int, ...], border: int) -> np.ndarray:
     """A mask [height, width] of the pixels that are not at the border."""
     if 2 * border >= min(shape):
-        raise InputError(f"--trim-border {border}: nothing is left of {shape[0]}x{shape[1]} pixels; use a smaller one")
+        raise InputError(f"--crop-border {border}: nothing is left of {shape[0]}x{shape[1]} pixels; use a smaller one")
     inner = np.zeros(shape, bool)
     inner[border : shape[0] - border, border : shape[1] - border] = True
     return inner

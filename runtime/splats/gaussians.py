@@ -43,7 +43,7 @@ class Gaussians:
     def __len__(self) -> int:
         return len(self.means)
 
-    def taken(self, index: np.ndarray) -> "Gaussians":
+    def select(self, index: np.ndarray) -> "Gaussians":
         """Some of the Gaussians: those that a mask keeps, or these, in this order."""
         return Gaussians(*(getattr(self, field.name)[index] for field in fields(self)))
 

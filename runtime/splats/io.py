@@ -21,7 +21,7 @@ from .gaussians import Gaussians, check_finite
 from .points import points_from_gaussians, write_point_cloud
 
 
-class SceneFormat(NamedTuple):
+class SplatFormat(NamedTuple):
     """How Gaussians become one kind of file and come back.
 
     write: is given what was subtracted from the world coordinates, [3]; returns a line for each thing that the file
@@ -59,12 +59,12 @@ def _read_ply(path: Path) -> Gaussians:
 
 
 FORMATS = {
-    ".ply": SceneFormat(_write_ply, _read_ply, header_offset),
-    ".compressed.ply": SceneFormat(write_compressed_ply, _read_ply, header_offset),
-    ".splat": SceneFormat(_write_splat, read_splat),
-    ".spz": SceneFormat(_write_spz, read_spz),
-    ".sog": SceneFormat(write_sog, read_sog, sog_offset),
-    ".glb": SceneFormat(write_glb, read_glb, glb_offset),
+    ".ply": SplatFormat(_write_ply, _read_ply, header_offset),
+    ".compressed.ply": SplatFormat(write_compressed_ply, _read_ply, header_offset),
+    ".splat": SplatFormat(_write_splat, read_splat),
+    ".spz": SplatFormat(_write_spz, read_spz),
+    ".sog": SplatFormat(write_sog, read_sog, sog_offset),
+    ".glb": SplatFormat(write_glb, read_glb, glb_offset),
 }
 
 
@@ -73,7 +73,7 @@ POINTS = (".points.ply", ".points.glb", ".obj", ".xyz")
 MESHES = (".mesh.ply", ".mesh.glb", ".mesh.obj")
 
 
-def write_scene(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None) -> list[str]:
+def write_splats(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None) -> list[str]:
     """Write Gaussians in the format that the file's name asks for; the file appears whole or not at all.
 
     As points, they are their centres in the colour that they have from all sides.
@@ -82,7 +82,7 @@ def write_scene(path: Path, gaussians: Gaussians, offset: np.ndarray | None = No
     Returns a line for each thing that the format cannot hold, such as spherical harmonics.
     Raises InputError for an unknown name, values that no file can hold, or a place that cannot be written.
     """
-    suffix, offset = scene_suffix(path), np.zeros(3) if offset is None else offset
+    suffix, offset = splat_suffix(path), np.zeros(3) if offset is None else offset
     if suffix in MESHES:
         raise InputError(f"{path}: a surface is made of depth maps, not of Gaussians; write it with idesplat-infer")
     if suffix in POINTS:
@@ -97,11 +97,11 @@ def read_offset(path: Path) -> np.ndarray:
 
     Zeros where the file says nothing. Raises InputError if it cannot be read.
     """
-    read = FORMATS[scene_suffix(path)].offset
+    read = FORMATS[splat_suffix(path)].offset
     return np.zeros(3) if read is None else read(Path(path))
 
 
-def read_scene(path: Path) -> Gaussians:
+def read_splats(path: Path) -> Gaussians:
     """Read Gaussians from a file in any of the formats; raises InputError if that is not possible."""
     suffix, expected = _ending(path, (*FORMATS, *POINTS, *MESHES)), ", ".join(FORMATS)
     if suffix is None:
@@ -111,7 +111,7 @@ def read_scene(path: Path) -> Gaussians:
     return FORMATS[suffix].read(Path(path))
 
 
-def scene_suffix(path: Path) -> str:
+def splat_suffix(path: Path) -> str:
     """The longest ending of a file's name that stands for a format; raises InputError if there is none."""
     known = (*FORMATS, *POINTS, *MESHES)
     suffix = _ending(path, known)
@@ -127,10 +127,10 @@ def _ending(path: Path, known: Sequence[str]) -> str | None:
 
 
 def holds_splats(path: Path) -> bool:
-    """Whether the file's name asks for splats, not points or a surface; raises InputError as `scene_suffix`."""
-    return scene_suffix(path) in FORMATS
+    """Whether the file's name asks for splats, not points or a surface; raises InputError as `splat_suffix`."""
+    return splat_suffix(path) in FORMATS
 
 
 def is_surface(path: Path) -> bool:
-    """Whether the file's name asks for a surface; raises InputError as `scene_suffix`."""
-    return scene_suffix(path) in MESHES
+    """Whether the file's name asks for a surface; raises InputError as `splat_suffix`."""
+    return splat_suffix(path) in MESHES

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 
 from ..geometry.consistency import confidence
-from ..images.writing import depth_colours, depth_ends, to_bytes
-from ..rendering.render_view import draw_view
+from ..images.writing import depth_colours, inverse_depth_range, to_bytes
+from ..rendering.render import render_view
 from ..splats.gaussians import Gaussians
 from ..splats.points import points_from_depth
 from ..system.files import replacing
@@ -66,7 +66,7 @@ def write_report(path: Path, depth: np.ndarray, gaussians: Gaussians, views: Vie
     """
     shown = dict(summary)
     seconds, notes, files = shown.pop("seconds"), shown.pop("notes"), shown.pop("files")
-    far, near = depth_ends(depth)
+    far, near = inverse_depth_range(depth)
     count = f"{len(views.names)} photographs became {len(gaussians):,} Gaussians."
     page = PAGE.substitute(
         title=html.escape(f"idesplat: {Path(files[0]).name}"),
@@ -90,7 +90,7 @@ def _sections(depth: np.ndarray, gaussians: Gaussians, views: Views, ends: tuple
     Ks = views.intrinsics.astype(np.float64) * np.array([width, height, 1.0])[:, None]  # [views, 3, 3]
     for index in progress(range(len(depth)), "drawing the report"):
         photograph = to_bytes(views.images[index].transpose(1, 2, 0))
-        drawn = to_bytes(draw_view(gaussians, views.extrinsics[index], Ks[index], width, height).rgb)
+        drawn = to_bytes(render_view(gaussians, views.extrinsics[index], Ks[index], width, height).rgb)
         low, middle, high = np.percentile(depth[index], (0, 50, 100))
         colours = cv2.applyColorMap(to_bytes(confirmed[index]), cv2.COLORMAP_VIRIDIS)[..., ::-1]
         figures = [

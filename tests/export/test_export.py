@@ -13,8 +13,8 @@ from conftest import SMALL_PRESET, run_command, small_network
 from idesplat.export import cli
 from idesplat.export.stages import example_inputs
 from idesplat.export.validation.compare import Figures, TensorError
-from idesplat.runtime.inference.metadata import INPUTS, OUTPUTS, read_description, read_manifest
-from idesplat.runtime.inference.predictor import Runner
+from idesplat.runtime.inference.metadata import INPUTS, OUTPUTS, read_manifest, read_metadata
+from idesplat.runtime.inference.predictor import Predictor
 
 STAGES = ["encoder", "dpbu1", "dpbu2", "dpbu3", "gaussians"]
 
@@ -59,7 +59,7 @@ def test_description(exported, small_checkpoint):
     import hashlib
 
     properties = {entry.key: entry.value for entry in onnx.load(exported[0]).metadata_props}
-    description = read_description(properties, exported[0])
+    description = read_metadata(properties, exported[0])
     assert description.preset == SMALL_PRESET
     assert (description.near, description.far, description.sh_degree) == (0.5, 100.0, 2)
     assert (description.height, description.width, description.size_multiple) == (64, 96, 16)
@@ -73,7 +73,7 @@ def test_one_file_serves_every_number_of_views_and_size(exported, views, height,
     inputs = example_inputs(views, height, width, 0.5, 100.0)
     with torch.no_grad():
         expected = small_network()(*inputs.values())
-    found = Runner(exported[0]).predict_arrays(*(inputs[name].numpy() for name in INPUTS))
+    found = Predictor(exported[0]).predict_arrays(*(inputs[name].numpy() for name in INPUTS))
     for name, value in {"depth": expected.depth, **expected.gaussians._asdict()}.items():
         ours = found.depth if name == "depth" else getattr(found.gaussians, name)
         assert ours.shape == tuple(value.shape)
@@ -85,7 +85,7 @@ def test_staged_folder_gives_what_the_fused_file_gives(exported):
     fused, staged = exported
     inputs = example_inputs(3, 64, 96, 0.5, 100.0)
     arrays = [inputs[name].numpy() for name in INPUTS]
-    whole, parts = Runner(fused).predict_arrays(*arrays), Runner(staged).predict_arrays(*arrays)
+    whole, parts = Predictor(fused).predict_arrays(*arrays), Predictor(staged).predict_arrays(*arrays)
     assert list(parts.seconds) == STAGES
     np.testing.assert_allclose(parts.depth, whole.depth, rtol=1e-4)
     np.testing.assert_allclose(parts.gaussians.sh, whole.gaussians.sh, atol=1e-3)
@@ -108,10 +108,10 @@ def test_fixed_views_and_size(small_checkpoint, presets, tmp_path, capsys):
         value.name: [dim.dim_value for dim in value.type.tensor_type.shape.dim] for value in onnx.load(out).graph.input
     }
     assert shapes["images"] == [2, 3, 64, 64]
-    runner = Runner(out)
+    predictor = Predictor(out)
     inputs = example_inputs(3, 64, 64, 0.5, 100.0)
     with pytest.raises(ValueError, match="2 views and got 3"):
-        runner.predict_arrays(*(inputs[name].numpy() for name in INPUTS[:3]))
+        predictor.predict_arrays(*(inputs[name].numpy() for name in INPUTS[:3]))
     assert "fixed.onnx" in capsys.readouterr().out
 
 
@@ -132,7 +132,7 @@ def test_verification_notices_a_wrong_graph(exported):
 
     network = NamedTensors(small_network())
     properties = {entry.key: entry.value for entry in onnx.load(exported[0]).metadata_props}
-    description = read_description(properties, exported[0])
+    description = read_metadata(properties, exported[0])
     with torch.no_grad():
         network.model.dpbu1.merge.conv.weight *= 1.1
     stages = [
@@ -209,7 +209,7 @@ def test_a_full_disk_is_named_and_leaves_nothing(small_checkpoint, presets, tmp_
 def test_metadata_of_another_layout_is_refused(tmp_path):
     content = json.dumps({"layout": 99})
     with pytest.raises(ValueError, match="layout 99, expected 1"):
-        read_description({"idesplat": content}, tmp_path)
+        read_metadata({"idesplat": content}, tmp_path)
 
 
 def test_without_pytorch_the_remedy_is_named(small_checkpoint, tmp_path, monkeypatch, capsys):

@@ -19,7 +19,7 @@ from idesplat.model.config import PRESETS
 from idesplat.model.registry import build
 from idesplat.runtime.cli.infer import main as infer
 from idesplat.runtime.inference.metadata import INPUTS, read_manifest
-from idesplat.runtime.inference.predictor import Runner
+from idesplat.runtime.inference.predictor import Predictor
 from reference_weights import draw_tensor
 
 SIZE = {"height": 64, "width": 96}
@@ -70,7 +70,7 @@ def arrays(views, height, width):
 @pytest.mark.parametrize(("views", "height", "width"), ((2, 64, 96), (3, 64, 96), (4, 96, 64)))
 def test_one_file_serves_every_number_of_views_and_size(graphs, name, views, height, width):
     inputs, given = arrays(views, height, width)
-    found = Runner(graphs[name][0]).predict_arrays(*given, near=0.5, far=100.0)
+    found = Predictor(graphs[name][0]).predict_arrays(*given, near=0.5, far=100.0)
     with torch.no_grad():
         expected = network(name)(*inputs.values())
     error = np.abs(found.depth - expected.depth.numpy()) / expected.depth.numpy()
@@ -90,7 +90,7 @@ def test_stages_are_the_networks_own_and_give_the_same(graphs, name):
     fused, staged = graphs[name]
     assert [stage.name for stage in read_manifest(staged)] == STAGES[name]
     _, given = arrays(3, 64, 96)
-    whole, parts = Runner(fused).predict_arrays(*given), Runner(staged).predict_arrays(*given)
+    whole, parts = Predictor(fused).predict_arrays(*given), Predictor(staged).predict_arrays(*given)
     assert list(parts.seconds) == STAGES[name]
     np.testing.assert_allclose(parts.depth, whole.depth, rtol=1e-4)
 
@@ -106,8 +106,8 @@ def test_depth_alone_is_all_that_such_a_graph_yields(graphs):
     fused, staged = graphs["depthsplat-alone"]
     for path in (fused, staged / "depth2.onnx"):
         assert [value.name for value in onnx.load(path).graph.output] == ["depth"]
-    assert not Runner(fused).description.gaussians
-    assert Runner(graphs["depthsplat-two"][0]).description.gaussians
+    assert not Predictor(fused).metadata.gaussians
+    assert Predictor(graphs["depthsplat-two"][0]).metadata.gaussians
 
 
 # ---- weights beside the graph, where one file cannot hold them
@@ -124,9 +124,9 @@ def test_weights_beside_the_graph_are_found_wherever_both_are_moved(graphs, tmp_
     assert f"{beside} holds the weights" in capsys.readouterr().out
     before.rename(after)
     _, given = arrays(2, 64, 96)
-    expected = Runner(graphs["depthsplat-alone"][0]).predict_arrays(*given).depth
+    expected = Predictor(graphs["depthsplat-alone"][0]).predict_arrays(*given).depth
     for model in (after / "model.onnx", after / "staged"):
-        np.testing.assert_array_equal(Runner(model).predict_arrays(*given).depth, expected)
+        np.testing.assert_array_equal(Predictor(model).predict_arrays(*given).depth, expected)
 
 
 # ---- a model that predicts depth alone, in use

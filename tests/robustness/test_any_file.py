@@ -22,7 +22,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from idesplat.export.existing_exports import foreign_entries, is_our_graph
 from idesplat.model.checkpoint import CheckpointError, read_state_dict
-from idesplat.runtime import Runner
+from idesplat.runtime import Predictor
 from idesplat.runtime.cameras.io import CameraFormat, read_cameras, write_cameras
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.images.exif import exif_focal, given_focal
@@ -123,7 +123,7 @@ def resume(state: TrainingState, path: Path) -> None:
 
 
 def run_model(path: Path) -> None:
-    Runner(path)
+    Predictor(path)
 
 
 def read_written(path: Path) -> None:
@@ -208,7 +208,7 @@ def read_some_cameras(path: Path) -> None:
 
 
 def read_staged(path: Path) -> None:
-    """The manifest as the runner reads it, and as the exporter asks whether the folder is its own."""
+    """The manifest as the predictor reads it, and as the exporter asks whether the folder is its own."""
     for name in ("a.onnx", "b.onnx"):
         (path.parent / name).touch()
     foreign_entries(path.parent)
@@ -280,7 +280,7 @@ def test_any_metadata_of_a_graph(targets: dict[str, Target], tmp_path: Path, dat
     path = tmp_path / "model.onnx"
     path.write_bytes(model.SerializeToString())
     try:
-        Runner(path)
+        Predictor(path)
     except InputError as error:
         assert_one_line(error, path)
 

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 from conftest import USUAL_SIGINT
-from idesplat.runtime.inference.bundled_model import default_model
+from idesplat.runtime.inference.bundled_model import bundled_model
 from idesplat.runtime.splats.formats.ply import write_ply
 from idesplat.runtime.splats.gaussians import with_colours
 from idesplat.runtime.system.files import replacing, scratch_folder
@@ -79,7 +79,7 @@ def test_no_code_of_the_current_folder_runs_in_benchmarks(tmp_path):
     code = (
         "from idesplat.tools.benchmark.worker import Worker, describe\n"
         "if __name__ == '__main__':\n"
-        f"    with Worker(describe, __import__('pathlib').Path({str(default_model())!r})) as worker:\n"
+        f"    with Worker(describe, __import__('pathlib').Path({str(bundled_model())!r})) as worker:\n"
         "        print(worker.about['preset'])\n"
     )
     script = tmp_path.parent / f"{tmp_path.name}.py"
@@ -473,7 +473,7 @@ def test_readers_take_regular_files_alone(tmp_path, kind):
             "import sys\n"
             "from pathlib import Path\n"
             "from idesplat.runtime.cameras.io import CameraFormat, read_cameras\n"
-            "from idesplat.runtime.splats.io import read_scene\n"
+            "from idesplat.runtime.splats.io import read_splats\n"
             "from idesplat.runtime.inference.session import open_session\n"
             "from idesplat.tools.benchmark.report import read_rows\n"
             "from idesplat.tools.evaluation.chunks import read_chunk, read_index\n"
@@ -487,7 +487,7 @@ def test_readers_take_regular_files_alone(tmp_path, kind):
             f"splats, cameras = {SPLATS!r}, {CAMERAS!r}\n"
             "forms = [CameraFormat.TRANSFORMS, CameraFormat.OWN, CameraFormat.RE10K, CameraFormat.OPENCV,\n"
             "         CameraFormat.LLFF, CameraFormat.DTU]\n"
-            "tries = [(read_scene, name) for name in splats] + [(read_cameras, name) for name in cameras]\n"
+            "tries = [(read_splats, name) for name in splats] + [(read_cameras, name) for name in cameras]\n"
             "tries += [(lambda p, form=form: read_cameras(p, (), form), name) for form, name in zip(forms, cameras)]\n"
             "tries += [(open_session, 'model.onnx'), (read_index, 'index.json'), (read_rows, 'rows.json')]\n"
             "tries += [(read_chunk, 'chunk.torch'), (image_size, 'else/a.png'), (load_image, 'else/a.png')]\n"
@@ -543,10 +543,10 @@ def test_a_pipe_in_the_cache_is_replaced(tmp_path, monkeypatch):
     from idesplat.runtime.inference.session import open_session
 
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    place = graph_cache.place_for(default_model())
+    place = graph_cache.cache_entry(bundled_model())
     entry = place.folder / f"{place.key}.{'0' * 64}.onnx"
     os.mkfifo(entry)
-    open_session(default_model())
+    open_session(bundled_model())
     assert not entry.exists()
     assert len(list(place.folder.iterdir())) == 1
 
@@ -561,7 +561,7 @@ def test_what_was_left_in_the_cache_is_collected(tmp_path, monkeypatch):
     left.mkdir(parents=True)
     (left / files.LOCK_NAME).touch()
     (left / "graph.onnx").write_bytes(b"half")
-    assert graph_cache.place_for(default_model()) is not None
+    assert graph_cache.cache_entry(bundled_model()) is not None
     assert not left.exists()
 
 

@@ -20,7 +20,7 @@ from idesplat.model.checkpoint import fill
 from idesplat.model.common.gaussian_adapter import WorldGaussians
 from idesplat.model.registry import Network, build
 from idesplat.runtime.inference.metadata import INPUTS
-from idesplat.runtime.inference.session import Tuning, open_session, run_session
+from idesplat.runtime.inference.session import SessionConfig, open_session, run_session
 from parity_cases import CASES as IDESPLAT_CASES
 from parity_cases import DEPTHSPLAT_CASES as DEPTHSPLAT_CASES
 from parity_cases import as_reference
@@ -75,7 +75,7 @@ def variants(
         exported = Exported([(stage, graphs.of_stage(stage)) for stage in graphs.stages], staged=False)
         rows = compare(exported, [between], tolerance_for(network, precision))
         stages[precision] = max(row.errors.median for row in rows)
-        session = open_session(graphs.whole, tuning=Tuning(THREADS))
+        session = open_session(graphs.whole, config=SessionConfig(THREADS))
         runs[precision] = lambda session=session: {
             name: torch.from_numpy(value) for name, value in run_session(session, feeds).items()
         }

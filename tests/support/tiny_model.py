@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import onnx.parser
-from idesplat.runtime.inference.metadata import METADATA_KEY, Description
+from idesplat.runtime.inference.metadata import METADATA_KEY, ModelMetadata
 from onnx import helper
 
-OWN = Description(
+OWN = ModelMetadata(
     preset="tiny",
     height=64,
     width=96,

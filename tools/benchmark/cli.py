@@ -56,7 +56,7 @@ class Entry:
 
     model: Path
     provider: str
-    description: dict[str, Any]
+    metadata: dict[str, Any]
 
 
 @exit_on_input_error
@@ -276,11 +276,11 @@ def _shapes(text: str | None) -> list[tuple[int, int]]:
 
 def _entries(models: Sequence[Path], providers: Sequence[str], say: Say) -> list[Entry]:
     """Every model on every provider; raises InputError for a file that is not a model of this project."""
-    from ...runtime.inference.bundled_model import default_model
+    from ...runtime.inference.bundled_model import bundled_model
     from .worker import Failed, Worker, describe
 
     entries = []
-    for model in models or [default_model()]:
+    for model in models or [bundled_model()]:
         say(f"{model.name}: reading")
         try:
             with Worker(describe, model) as worker:
@@ -299,7 +299,7 @@ def _workloads(
     groups: dict[tuple[int, int], list[Entry]] = {shape: list(entries) for shape in shapes}
     if not shapes:
         for entry in entries:
-            groups.setdefault((entry.description["height"], entry.description["width"]), []).append(entry)
+            groups.setdefault((entry.metadata["height"], entry.metadata["width"]), []).append(entry)
     for shape, group in groups.items():
         for count in counts:
             yield Workload(count, *shape), group
@@ -308,7 +308,7 @@ def _workloads(
 def _row(entry: Entry, workload: "Workload") -> "Row":
     from .report import Row
 
-    about = entry.description
+    about = entry.metadata
     names = (entry.model.name, about["preset"], about.get("precision", "float32"), entry.provider)
     return Row(*names, **asdict(workload), checkpoint=about["checkpoint_sha256"])
 

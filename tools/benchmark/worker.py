@@ -150,25 +150,25 @@ def matrix() -> Prepared:
 
 def describe(model: Path) -> Prepared:
     """What a model's file says of itself."""
-    from ...runtime.inference.predictor import Runner
+    from ...runtime.inference.predictor import Predictor
 
-    return asdict(Runner(model).description), dict
+    return asdict(Predictor(model).metadata), dict
 
 
 def exported(model: Path, provider: str, threads: int, workload: Workload) -> Prepared:
     """An exported model; `about` holds how long it took to open, and the depth that it predicts."""
-    from ...runtime.inference.predictor import Runner
-    from ...runtime.inference.session import Tuning
+    from ...runtime.inference.predictor import Predictor
+    from ...runtime.inference.session import SessionConfig
 
     started = time.perf_counter()
-    runner = Runner(model, provider, Tuning(threads))
+    predictor = Predictor(model, provider, SessionConfig(threads))
     load_seconds = time.perf_counter() - started
-    arrays = example_arrays(workload, runner.description.near, runner.description.far)
+    arrays = example_arrays(workload, predictor.metadata.near, predictor.metadata.far)
 
     def run() -> None:
-        runner.predict_arrays(*arrays)
+        predictor.predict_arrays(*arrays)
 
-    depth = runner.predict_arrays(*arrays).depth
+    depth = predictor.predict_arrays(*arrays).depth
     return {"load_seconds": load_seconds, "depth": depth}, run
 
 
@@ -230,16 +230,16 @@ def example_arrays(workload: Workload, near: float, far: float) -> tuple[np.ndar
 
 def _profile(model: Path, provider: str, threads: int, workload: Workload, optimise: bool) -> list[dict[str, Any]]:
     """ONNX Runtime's notes on every operator of a run; where it is optimised, of one that is not the first."""
-    from ...runtime.inference.predictor import Runner
-    from ...runtime.inference.session import Tuning
+    from ...runtime.inference.predictor import Predictor
+    from ...runtime.inference.session import SessionConfig
     from ...runtime.system.files import scratch_folder
 
     with scratch_folder() as folder:
-        runner = Runner(model, provider, Tuning(threads, folder / "profile", optimise))
-        arrays = example_arrays(workload, runner.description.near, runner.description.far)
+        predictor = Predictor(model, provider, SessionConfig(threads, folder / "profile", optimise))
+        arrays = example_arrays(workload, predictor.metadata.near, predictor.metadata.far)
         for _ in range(TIMES_PROFILED if optimise else 1):
-            runner.predict_arrays(*arrays)
-        return [kernel for path in runner.end_profiling() for kernel in last_kernels(path)]
+            predictor.predict_arrays(*arrays)
+        return [kernel for path in predictor.end_profiling() for kernel in last_kernels(path)]
 
 
 def last_kernels(profile: Path) -> list[dict[str, Any]]:

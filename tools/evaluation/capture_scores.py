@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...runtime.inference.predictor import Runner
+from ...runtime.inference.predictor import Predictor
 from ...runtime.splats.gaussians import Gaussians
 from .baselines import best_plane, nearest_view
 from .captures import PAIR, Capture, CaptureImages
@@ -64,8 +64,8 @@ class CaptureEvaluator:
     lpips: the measure, where it is installed.
     """
 
-    def __init__(self, runner: Runner, lpips: LPIPS | None) -> None:
-        self.runner, self.lpips = runner, lpips
+    def __init__(self, predictor: Predictor, lpips: LPIPS | None) -> None:
+        self.predictor, self.lpips = predictor, lpips
 
     def evaluate(
         self, capture: Capture, images: CaptureImages, counts: Sequence[int], show: Show | None = None
@@ -82,7 +82,7 @@ class CaptureEvaluator:
         for count in counts:
             if count == PAIR:
                 result.cases[count] = [
-                    self._triple(images.case(triple.context, [triple.target], self.runner.depth_range), show)
+                    self._triple(images.case(triple.context, [triple.target], self.predictor.depth_range), show)
                     for triple in capture.triples
                 ]
                 continue
@@ -92,9 +92,9 @@ class CaptureEvaluator:
             for target in targets:
                 if target not in pairs:
                     triple = capture.neighbours(target)
-                    case = images.case(triple.context, [target], self.runner.depth_range)
+                    case = images.case(triple.context, [target], self.predictor.depth_range)
                     pairs[target] = self._triple(case, None).targets[0].scores
-            case = images.case(context, targets, self.runner.depth_range)
+            case = images.case(context, targets, self.predictor.depth_range)
             result.cases[count] = [self._window(case, pairs, show)]
         return result
 
@@ -129,7 +129,7 @@ class CaptureEvaluator:
 
     def _predict(self, case: Case) -> tuple[Gaussians, float]:
         context, started = case.context, time.perf_counter()
-        prediction = self.runner.predict_arrays(
+        prediction = self.predictor.predict_arrays(
             context.images, context.extrinsics, context.intrinsics, case.near, case.far
         )
         return prediction.need_gaussians(), time.perf_counter() - started

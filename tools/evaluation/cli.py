@@ -14,7 +14,7 @@ from ...runtime.cli.outputs import Overwrite, guards_outputs, name_files, output
 from ...runtime.cli.terminal import run, say
 from ...runtime.errors import InputError, exit_on_input_error
 from ...runtime.images.sizes import parse_size
-from ...runtime.inference.bundled_model import default_model
+from ...runtime.inference.bundled_model import bundled_model
 from ...runtime.system.files import scratch_folder
 from ...runtime.system.progress import progress
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:  # nothing heavy is loaded before there is something to evalua
     import numpy as np
 
     from ...runtime.cameras.camera import Camera
-    from ...runtime.inference.predictor import Runner
+    from ...runtime.inference.predictor import Predictor
     from .cases import Case
     from .novel_views import Evaluator, Result
 
@@ -78,20 +78,20 @@ def scene(
 
     found = find_images([images])
     frames = match(found, read_cameras(cameras, found))
-    runner = _runner(model, out, [*found, *camera_files(cameras)])
-    count = runner.view_count(views, None, DEFAULT_VIEWS) or DEFAULT_VIEWS
+    predictor = _runner(model, out, [*found, *camera_files(cameras)])
+    count = predictor.view_count(views, None, DEFAULT_VIEWS) or DEFAULT_VIEWS
     chosen = chosen_frames(frames, context or [], target or [], count, hold_out_every)
-    shape = parse_size(size) if size else runner.size_for([camera for _, camera in frames])
+    shape = parse_size(size) if size else predictor.size_for([camera for _, camera in frames])
     for sources, held_out in chosen:
-        runner.check_size(len(sources), *shape)
+        predictor.check_size(len(sources), *shape)
         say(f"held out {_names(frames, held_out)}, inferred from {_names(frames, sources)}")
-    find_range = partial(runner.depth_range, near=near, far=far)
+    find_range = partial(predictor.depth_range, near=near, far=far)
     cases = (load_case(frames, *numbers, shape, find_range, depth) for numbers in chosen)
-    results = _evaluate(cases, len(chosen), Evaluator(runner, load_lpips()), out, pictured=len(chosen))
+    results = _evaluate(cases, len(chosen), Evaluator(predictor, load_lpips()), out, pictured=len(chosen))
     means = mean_of_views(results)
     print_views(results)
     print_means(means, f"{sum(len(result.targets) for result in results)} views held out, {_by(shape)}")
-    _write(out, {"command": "scene", "images": str(images), "size": shape}, runner, means, results)
+    _write(out, {"command": "scene", "images": str(images), "size": shape}, predictor, means, results)
 
 
 @app.command()
@@ -113,17 +113,17 @@ def chunks(
     from .report import print_means
 
     entries, files = read_index(index), find_chunks(folder)
-    runner = _runner(model, out, [index, *files])
-    own = runner.description
+    predictor = _runner(model, out, [index, *files])
+    own = predictor.metadata
     for views in sorted({len(entry.context) for entry in entries.values()}):
-        runner.check_size(views, own.height, own.width)
+        predictor.check_size(views, own.height, own.width)
     shape = own.height, own.width
     near, far = near if near is not None else own.near, far if far is not None else own.far
     if not 0 < near < far:
         raise InputError(
             f"near {near:g} and far {far:g}: expected 0 < near < far; give --near and --far in scene units"
         )
-    evaluator = Evaluator(runner, load_lpips(), compare=False, nearest_drawn=NEAREST_DRAWN * near)
+    evaluator = Evaluator(predictor, load_lpips(), compare=False, nearest_drawn=NEAREST_DRAWN * near)
     skipped: dict[str, str] = {}
     cases = chunk_cases(files, entries, shape, (near, far), skipped.__setitem__)
     results = _evaluate(cases, len(entries), evaluator, out, PICTURED, skipped.__setitem__)
@@ -140,7 +140,7 @@ def chunks(
     if missing:
         say(f"{missing} of the index's scenes are not in {folder}")
     about = {"command": "chunks", "index": str(index), "size": shape, "skipped": skipped, "missing": missing}
-    _write(out, about, runner, means, results)
+    _write(out, about, predictor, means, results)
 
 
 @app.command()
@@ -171,17 +171,17 @@ def procedural(
     from .novel_views import Evaluator, mean_of_scenes
     from .report import print_means
 
-    runner = _runner(model, out, [])
-    shape = parse_size(size) if size else (runner.description.height, runner.description.width)
-    runner.check_size(views, *shape)
+    predictor = _runner(model, out, [])
+    shape = parse_size(size) if size else (predictor.metadata.height, predictor.metadata.width)
+    predictor.check_size(views, *shape)
     drawn = views if drawn is None else drawn
     if drawn < views:
         raise InputError(f"--drawn {drawn}: expected at least the {views} of --views")
     cases = (procedural_case(seed, views, drawn, TARGETS, *shape) for seed in HELD_OUT_SEEDS[:scenes])
-    results = _evaluate(cases, scenes, Evaluator(runner, load_lpips()), out, PICTURED)
+    results = _evaluate(cases, scenes, Evaluator(predictor, load_lpips()), out, PICTURED)
     means = mean_of_scenes(results)
     print_means(means, f"{scenes} held-out procedural scenes, {views} of {drawn} views, {_by(shape)}")
-    _write(out, {"command": "procedural", "views": views, "drawn": drawn, "size": shape}, runner, means, results)
+    _write(out, {"command": "procedural", "views": views, "drawn": drawn, "size": shape}, predictor, means, results)
 
 
 @app.command()
@@ -207,12 +207,12 @@ def captures(
     from .metrics import load_lpips
 
     chosen, counts = read_captures(capture or []), parse_view_counts(views)
-    runner = _runner(model, out, [])
-    shape = parse_size(size) if size else (runner.description.height, runner.description.width)
+    predictor = _runner(model, out, [])
+    shape = parse_size(size) if size else (predictor.metadata.height, predictor.metadata.width)
     for count in counts:
-        runner.check_size(count, *shape)
+        predictor.check_size(count, *shape)
     folder = checkouts or clones_folder()
-    evaluator, results = CaptureEvaluator(runner, load_lpips()), []
+    evaluator, results = CaptureEvaluator(predictor, load_lpips()), []
     for entry in progress(chosen, "evaluating"):
         with scratch_folder() as images:
             checkout = fetch_checkout(folder, entry.repository, entry.commit)
@@ -221,7 +221,7 @@ def captures(
             results.append(evaluator.evaluate(entry, loaded, counts, partial(_save_strip, out)))
     print_captures(results, counts, _by(shape))
     about = {"command": "captures", "size": shape, "views": counts}
-    path = write_capture_results(out, about | _about(runner), results, counts)
+    path = write_capture_results(out, about | _about(predictor), results, counts)
     say(f"wrote {path}")
     say(f"strips (truth, render, error, depth, and for triples the best plane) are beside it in {out}")
 
@@ -239,21 +239,21 @@ def _by(shape: tuple[int, int]) -> str:
     return f"{shape[0]}x{shape[1]}"
 
 
-def _runner(model: Path | None, out: Path, data: Sequence[Path]) -> "Runner":
+def _runner(model: Path | None, out: Path, data: Sequence[Path]) -> "Predictor":
     """The model, once it is known that results can be written, and will replace nothing of the data or the user.
 
     Pictures are named after scenes, which may not be known yet, so any that is there counts as one to be replaced.
     """
-    from ...runtime.inference.predictor import Runner
+    from ...runtime.inference.predictor import Predictor
     from .report import RESULTS
 
-    path = model or default_model()
+    path = model or bundled_model()
     run = outputs()
     run.reads("the model", model_files(path))
     run.reads("data", data)
     run.writes_into("--out", out)
     run.writes("--out", [out / RESULTS, *out.glob("*.png")])
-    return Runner(path)
+    return Predictor(path)
 
 
 def _evaluate(
@@ -285,16 +285,20 @@ def _save_strip(out: Path, name: str, strip: "np.ndarray") -> None:
     save_png(out / f"{name}.png", strip)
 
 
-def _about(runner: "Runner") -> dict[str, Any]:
-    return {"model": {"path": str(runner.path), **asdict(runner.description)}}
+def _about(predictor: "Predictor") -> dict[str, Any]:
+    return {"model": {"path": str(predictor.path), **asdict(predictor.metadata)}}
 
 
 def _write(
-    out: Path, about: dict[str, Any], runner: "Runner", means: dict[str, dict[str, float]], results: "list[Result]"
+    out: Path,
+    about: dict[str, Any],
+    predictor: "Predictor",
+    means: dict[str, dict[str, float]],
+    results: "list[Result]",
 ) -> None:
     """Write results.json and say what there is to look at."""
     from .report import write_results
 
-    path = write_results(out, about | _about(runner), means, results)
+    path = write_results(out, about | _about(predictor), means, results)
     say(f"wrote {path}")
     say(f"pictures (truth, render, error, depth, and the best plane where there is one) are beside it in {out}")

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...runtime.geometry.rigid import invert_rigid
 from ...runtime.images.writing import depth_colours
-from ...runtime.inference.predictor import Runner
+from ...runtime.inference.predictor import Predictor
 from ...runtime.rendering.rasterizer import rasterize
 from ...runtime.rendering.types import Rendering
 from ...runtime.splats.gaussians import Gaussians
@@ -62,7 +62,7 @@ class Evaluator:
     nearest_drawn: scene units from the camera at which Gaussians begin to be drawn.
     """
 
-    runner: Runner
+    predictor: Predictor
     lpips: LPIPS | None
     compare: bool = True
     nearest_drawn: float = NEAREST_DRAWN
@@ -74,7 +74,9 @@ class Evaluator:
         [0, 1], [height, all widths, 3]. Raises InputError for what the model cannot take.
         """
         given = case.context
-        prediction = self.runner.predict_arrays(given.images, given.extrinsics, given.intrinsics, case.near, case.far)
+        prediction = self.predictor.predict_arrays(
+            given.images, given.extrinsics, given.intrinsics, case.near, case.far
+        )
         exact = None
         if self.compare and case.depth is not None and (case.depth > 0).all():
             exact = splats_at(case.depth, given)

@@ -28,7 +28,7 @@ from ...model.config import PRESETS, IDESplatConfig
 from ...model.registry import Network, build
 from ...runtime.cli.terminal import run, say
 from ...runtime.errors import InputError, exit_on_input_error
-from ...runtime.inference.normalization import SceneFrame
+from ...runtime.inference.normalization import SceneNormalization
 from ...runtime.inference.session import CPU
 from ..benchmark.cli import thread_environment
 from ..benchmark.worker import Failed, Prepared, Worker, Workload, example_arrays, exported
@@ -153,12 +153,12 @@ def drawn(preset: str, checkpoint: Path, workload: Workload) -> Prepared:
     randomize_weights(network)
     torch.save({"state_dict": network.state_dict()}, checkpoint)
     images, extrinsics, intrinsics, near, far = example_arrays(workload, network.config.near, network.config.far)
-    frame = SceneFrame.of(extrinsics, near, network.config.near)
-    arrays = images, frame.enter(extrinsics), intrinsics, near, far
+    frame = SceneNormalization.of(extrinsics, near, network.config.near)
+    arrays = images, frame.apply(extrinsics), intrinsics, near, far
     with torch.inference_mode():
         depth = network(*(torch.from_numpy(array) for array in arrays)).depth.numpy()
     count = sum(parameter.numel() for parameter in network.parameters())
-    return (count, frame.leave_depth(depth)), dict
+    return (count, frame.invert_depth(depth)), dict
 
 
 def exporting(checkpoint: Path, preset: str, model: Path) -> Prepared:

@@ -13,9 +13,9 @@ import typer
 
 from ...runtime.cli.terminal import run, say
 from ...runtime.errors import exit_on_input_error
-from ...runtime.rendering.render_view import draw_view
+from ...runtime.rendering.render import render_view
 from ...runtime.splats.gaussians import Gaussians
-from ...runtime.splats.io import FORMATS, read_scene, write_scene
+from ...runtime.splats.io import FORMATS, read_splats, write_splats
 from ..evaluation.metrics import psnr
 
 VIEWS = 2
@@ -57,9 +57,9 @@ def compare(gaussians: Annotated[int, typer.Option(help="How many.", min=100)] =
         for suffix in FORMATS:
             path = Path(folder) / f"scene{suffix}"
             started = time.process_time()
-            write_scene(path, scene)
+            write_splats(path, scene)
             written = time.process_time()
-            back = read_scene(path)
+            back = read_splats(path)
             read = time.process_time()
             quality = psnr(_draw(back), drawn, np.ones(drawn.shape[:2], bool))
             megabytes = path.stat().st_size / 1e6
@@ -71,7 +71,7 @@ def _draw(scene: Gaussians) -> np.ndarray:
     extrinsics = np.eye(4)
     extrinsics[0, 3] = 0.1
     K = np.array([[SIDE, 0, SIDE / 2], [0, SIDE, SIDE / 2], [0, 0, 1.0]])
-    return draw_view(scene, extrinsics, K, SIDE, SIDE).rgb
+    return render_view(scene, extrinsics, K, SIDE, SIDE).rgb
 
 
 def main() -> None:

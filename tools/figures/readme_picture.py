@@ -13,9 +13,9 @@ from ...runtime.cameras.io import read_cameras
 from ...runtime.cli.terminal import run, say
 from ...runtime.errors import exit_on_input_error
 from ...runtime.images.writing import depth_colours, save_png
-from ...runtime.inference.bundled_model import default_model
-from ...runtime.inference.predictor import Runner
-from ...runtime.rendering.render_view import draw_view
+from ...runtime.inference.bundled_model import bundled_model
+from ...runtime.inference.predictor import Predictor
+from ...runtime.rendering.render import render_view
 from ...runtime.views.batch import prepare
 
 # Two photographs, and one between them that the model is not given.
@@ -29,14 +29,14 @@ def picture(
 ) -> None:
     """Draw photograph, its depth, the view between from splats, the photograph there, and the other photograph."""
     cameras = read_cameras(scene / "transforms.json")
-    runner = Runner(default_model())
-    height, width = runner.size_for(cameras)
+    predictor = Predictor(bundled_model())
+    height, width = predictor.size_for(cameras)
     pairs = [(scene / cameras[view].name, cameras[view]) for view in (*CONTEXT, BETWEEN)]
     given = prepare(pairs[: len(CONTEXT)], None, height, width)
-    found = runner.predict_views(given)
+    found = predictor.predict_views(given)
     views = prepare(pairs, None, height, width)
     pixels = views.intrinsics[-1].astype(np.float64) * np.array([width, height, 1.0])[:, None]
-    between = draw_view(found.need_gaussians(), views.extrinsics[-1], pixels, width, height).rgb
+    between = render_view(found.need_gaussians(), views.extrinsics[-1], pixels, width, height).rgb
     first, second, truth = views.images.transpose(0, 2, 3, 1)
     save_png(out, np.hstack([first, depth_colours(found.depth[0]), between, truth, second]).astype(np.float32))
     say(f"wrote {out}")

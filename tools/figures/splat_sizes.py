@@ -17,8 +17,8 @@ from rich.table import Table
 
 from ...runtime.cli.terminal import run
 from ...runtime.errors import exit_on_input_error
-from ...runtime.inference.bundled_model import default_model
-from ...runtime.inference.predictor import Runner
+from ...runtime.inference.bundled_model import bundled_model
+from ...runtime.inference.predictor import Predictor
 from ...runtime.splats.gaussians import Gaussians
 from ..evaluation.baselines import SPLAT_PIXELS, splats_at
 from ..evaluation.cases import Case, procedural_case
@@ -38,24 +38,24 @@ def main(
     scenes: Annotated[int, typer.Option(help="Held-out drawn scenes.", min=1)] = 24,
 ) -> None:
     """Draw held-out scenes from splats of several sizes at the true depth, and from the model's own, where seen."""
-    runner = Runner(model or default_model())
+    predictor = Predictor(model or bundled_model())
     table = Table(
         "times as large", *(f"{size:g} pixels" for size in SIZES), OWN, title="PSNR, dB, where some input sees"
     )
     console = Console(stderr=True)
     for closer in CLOSER:
         seeds = track(HELD_OUT_SEEDS[:scenes], f"{closer} times as large", console=console, transient=True)
-        rows = [row for seed in seeds for row in _measured(runner, seed, closer)]
+        rows = [row for seed in seeds for row in _measured(predictor, seed, closer)]
         table.add_row(str(closer), *(f"{value:.2f}" for value in np.mean(rows, axis=0)))
     Console().print(table)
 
 
-def _measured(runner: Runner, seed: int, closer: int) -> list[list[float]]:
+def _measured(predictor: Predictor, seed: int, closer: int) -> list[list[float]]:
     """For each target of a scene its PSNR, dB, by size of the splats, and last by the model's own."""
-    own = runner.description
+    own = predictor.metadata
     case = procedural_case(seed, VIEWS, VIEWS, TARGETS, own.height, own.width, closer)
     given = case.context
-    predicted = runner.predict_arrays(given.images, given.extrinsics, given.intrinsics, case.near, case.far)
+    predicted = predictor.predict_arrays(given.images, given.extrinsics, given.intrinsics, case.near, case.far)
     assert case.depth is not None
     rule = splats_at(case.depth, given)
     scenes = [replace(rule, scales=rule.scales * np.float32(size / SPLAT_PIXELS)) for size in SIZES]

@@ -15,7 +15,7 @@ from torch import Tensor
 from ...runtime.cameras.camera import Camera
 from ...runtime.cameras.io import read_cameras
 from ...runtime.errors import InputError
-from ...runtime.inference.normalization import SceneFrame
+from ...runtime.inference.normalization import SceneNormalization
 from ...runtime.views.batch import Views as Photographs
 from ...runtime.views.batch import prepare, take
 from ...runtime.views.depth_range import find_depth_range
@@ -85,9 +85,9 @@ class FolderScenes:
     def _to_views(self, photographs: Photographs, context: int, targets: Sequence[tuple[Tensor, Tensor]]) -> Views:
         given = photographs.images, photographs.extrinsics, photographs.intrinsics
         found = find_depth_range(*given, photographs.cameras, self.trained)
-        frame = SceneFrame.of(photographs.extrinsics[:context], np.array([found.near]), self.trained[0])
+        frame = SceneNormalization.of(photographs.extrinsics[:context], np.array([found.near]), self.trained[0])
         near, far = (torch.full((context,), depth * frame.scale) for depth in (found.near, found.far))
-        poses = torch.from_numpy(frame.enter(photographs.extrinsics))
+        poses = torch.from_numpy(frame.apply(photographs.extrinsics))
         return Views(
             torch.from_numpy(photographs.images[:context]),
             poses[:context],

@@ -13,7 +13,7 @@ PIECES = 32  # in which many vectors find their place, so that a progress bar mo
 ROWS_AT_ONCE = 1 << 12  # their distances to a palette fit into the cache
 
 
-def codebook(values: np.ndarray) -> np.ndarray:
+def build_codebook(values: np.ndarray) -> np.ndarray:
     """256 rising numbers, float32, that stand for values of any shape.
 
     Half of them are spread evenly over the range, so that no value is farther from one than 1/256 of it, and half as
@@ -32,12 +32,12 @@ def codebook(values: np.ndarray) -> np.ndarray:
     return np.interp(places, share[order], grid[order]).astype(np.float32)
 
 
-def nearest(values: np.ndarray, book: np.ndarray) -> np.ndarray:
+def quantize(values: np.ndarray, book: np.ndarray) -> np.ndarray:
     """The index of the nearest entry of a codebook, uint8, for values of any shape."""
     return np.searchsorted((book[1:] + book[:-1]) / 2, values).astype(np.uint8)
 
 
-def palette(vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def cluster_vectors(vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Vectors [colours, parts] and, for each of vectors [n, parts], the index [n] of the one that stands for it.
 
     Few vectors stand for themselves. Of many, the palette is learned by k-means, always the same for the same vectors.

@@ -23,7 +23,7 @@ from ...system.files import read_bytes, replacing
 from ..gaussians import Gaussians, check_finite, check_ranges
 from .morton import morton_order
 from .ply_header import LIST, Element, offset_comment, read_header
-from .quantization import moved
+from .quantization import clipped_note
 
 CHUNK = 256  # Gaussians
 RANGES = (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))  # of a chunk
@@ -67,8 +67,8 @@ def write_compressed_ply(path: Path, gaussians: Gaussians, offset: np.ndarray | 
         file.write(chunks.tobytes())
         file.write(np.stack(words, axis=1).astype("<u4").tobytes())
         file.write(np.clip((rest / (2 * SH_LIMIT) + 0.5) * 256, 0, 255).astype(np.uint8).tobytes())
-    notes = moved("scales", gaussians.scales, np.exp(-LOG_SCALE_LIMIT), np.exp(LOG_SCALE_LIMIT))
-    return notes + moved("spherical harmonics", rest, -SH_LIMIT, SH_LIMIT)
+    notes = clipped_note("scales", gaussians.scales, np.exp(-LOG_SCALE_LIMIT), np.exp(LOG_SCALE_LIMIT))
+    return notes + clipped_note("spherical harmonics", rest, -SH_LIMIT, SH_LIMIT)
 
 
 def read_compressed_ply(path: Path) -> Gaussians:

@@ -16,7 +16,7 @@ from ...errors import InputError, refuse
 from ...geometry.quaternions import unit_quaternions
 from ...images.writing import linear_colours, to_bytes
 from ...system.files import check_expansion, read_bytes, replacing
-from ..axes import GLTF, half_turned
+from ..axes import GLTF, convert_axes
 from ..gaussians import Gaussians, bytes_in_memory, check_finite, check_ranges
 from .ply_header import OFFSET, checked_offset
 
@@ -55,7 +55,7 @@ def write_glb(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None
     check_finite(path, gaussians)
     if not len(gaussians):
         raise InputError(f"cannot write {path}: there are no Gaussians, and glTF knows nothing empty; write a .ply")
-    turned = half_turned(gaussians, GLTF)
+    turned = convert_axes(gaussians, GLTF)
     attributes = {
         "POSITION": turned.means,
         "COLOR_0": to_bytes(np.column_stack([linear_colours(turned.colours), turned.opacities])),
@@ -91,7 +91,7 @@ def read_glb(path: Path) -> Gaussians:
     check_finite(path, gaussians)
     if (gaussians.scales < 0).any() or ((gaussians.opacities < 0) | (gaussians.opacities > 1)).any():
         refuse(path, "negative scales, or opacities outside 0 to 1", "write it again")
-    return half_turned(gaussians, GLTF)
+    return convert_axes(gaussians, GLTF)
 
 
 def glb_offset(path: Path) -> np.ndarray:

@@ -25,10 +25,10 @@ from ...errors import InputError, refuse
 from ...geometry.quaternions import from_smallest_three, smallest_three, unit_quaternions
 from ...system.files import check_expansion, read_bytes, replacing
 from ..gaussians import Gaussians, bytes_in_memory, check_finite, check_ranges
-from .codebooks import ENTRIES, codebook, nearest, palette
+from .codebooks import ENTRIES, build_codebook, cluster_vectors, quantize
 from .morton import morton_order
 from .ply_header import OFFSET, checked_offset
-from .quantization import nearest_bytes
+from .quantization import round_to_uint8
 
 VERSION = 2
 META = "meta.json"
@@ -58,7 +58,7 @@ def write_sog(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None
     check_finite(path, gaussians)
     if not len(gaussians):
         raise InputError(f"cannot write {path}: there are no Gaussians, and a .sog knows no empty pictures")
-    gaussians = gaussians.taken(morton_order(gaussians.means))
+    gaussians = gaussians.select(morton_order(gaussians.means))
     files: dict[str, bytes] = {}
     meta: dict[str, Any] = {"version": VERSION, "asset": {"generator": "idesplat"}, "count": len(gaussians)}
     if offset is not None and offset.any():
@@ -74,10 +74,10 @@ def write_sog(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None
     files["scales.webp"], meta["scales"] = _coded(log_scales, "scales.webp")
     largest, others = smallest_three(unit_quaternions(gaussians.quats))
     files["quats.webp"] = _picture(
-        np.column_stack([nearest_bytes(others * QUAT_STEPS + 127.5), LARGEST_PART + largest])
+        np.column_stack([round_to_uint8(others * QUAT_STEPS + 127.5), LARGEST_PART + largest])
     )
     meta["quats"] = {"files": ["quats.webp"]}
-    opacities = nearest_bytes(gaussians.opacities * 255)
+    opacities = round_to_uint8(gaussians.opacities * 255)
     files["sh0.webp"], meta["sh0"] = _coded(gaussians.sh[:, 0], "sh0.webp", opacities)
     if gaussians.sh_degree:
         pictures, meta["shN"] = _harmonics(gaussians.sh[:, 1:], gaussians.sh_degree)
@@ -127,8 +127,8 @@ def _opened(path: Path) -> Iterator["_Reader"]:
 
 def _coded(values: np.ndarray, name: str, alpha: np.ndarray | None = None) -> tuple[bytes, dict[str, Any]]:
     """Values [gaussians, 3] as a picture of indices, and what meta.json says of it."""
-    book = codebook(values)
-    indices = nearest(values, book)
+    book = build_codebook(values)
+    indices = quantize(values, book)
     return _picture(indices if alpha is None else np.column_stack([indices, alpha])), {
         "codebook": book.tolist(),
         "files": [name],
@@ -138,9 +138,9 @@ def _coded(values: np.ndarray, name: str, alpha: np.ndarray | None = None) -> tu
 def _harmonics(rest: np.ndarray, degree: int) -> tuple[dict[str, bytes], dict[str, Any]]:
     """Spherical harmonics [gaussians, coefficients, 3] as a picture of sets and one of which set is whose."""
     count, coefficients, _ = rest.shape
-    sets, labels = palette(rest.reshape(count, -1))
-    book = codebook(sets)
-    indices = nearest(sets, book).reshape(len(sets), coefficients, 3)
+    sets, labels = cluster_vectors(rest.reshape(count, -1))
+    book = build_codebook(sets)
+    indices = quantize(sets, book).reshape(len(sets), coefficients, 3)
     rows = ceil(len(sets) / SETS_A_ROW)
     table = np.zeros((rows * SETS_A_ROW, coefficients, 3), np.uint8)
     table[: len(sets)] = indices

@@ -13,7 +13,7 @@ from ...errors import refuse
 from ...geometry.quaternions import unit_quaternions
 from ...system.files import read_bytes, replacing
 from ..gaussians import Gaussians, check_finite, check_ranges, with_colours
-from .quantization import moved, nearest_bytes
+from .quantization import clipped_note, round_to_uint8
 
 RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 ZERO, ONE = 128, 128  # of the rotation's bytes
@@ -30,13 +30,13 @@ def write_splat(path: Path, gaussians: Gaussians) -> list[str]:
     records = np.empty(len(gaussians), RECORD)
     records["mean"] = gaussians.means
     records["scale"] = gaussians.scales
-    records["rgba"][:, :3] = nearest_bytes(gaussians.colours * 255)
-    records["rgba"][:, 3] = nearest_bytes(gaussians.opacities * 255)
-    records["quat"] = nearest_bytes(unit_quaternions(gaussians.quats) * ONE + ZERO)
+    records["rgba"][:, :3] = round_to_uint8(gaussians.colours * 255)
+    records["rgba"][:, 3] = round_to_uint8(gaussians.opacities * 255)
+    records["quat"] = round_to_uint8(unit_quaternions(gaussians.quats) * ONE + ZERO)
     with replacing(path) as temporary:
         temporary.write_bytes(records.tobytes())
     lost = ["spherical harmonics above degree 0 left out"] if gaussians.sh_degree else []
-    return lost + moved("colours", gaussians.colours, 0, 1)
+    return lost + clipped_note("colours", gaussians.colours, 0, 1)
 
 
 def read_splat(path: Path) -> Gaussians:

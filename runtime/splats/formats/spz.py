@@ -20,9 +20,9 @@ from ...errors import refuse
 from ...geometry.quaternions import from_smallest_three, smallest_three, unit_quaternions
 from ...geometry.sh import SH_0
 from ...system.files import read_bytes, replacing
-from ..axes import OPENGL, half_turned
+from ..axes import OPENGL, convert_axes
 from ..gaussians import Gaussians, check_finite, check_ranges
-from .quantization import moved, nearest_bytes
+from .quantization import clipped_note, round_to_uint8
 from .spz_container import EXPECTED, HEADER, MAGIC, MOST_FRACTIONAL_BITS, unpack
 
 VERSION = 3  # to write: version 4 is not read everywhere yet
@@ -43,7 +43,7 @@ def write_spz(path: Path, gaussians: Gaussians) -> list[str]:
     """
     check_ranges(path, gaussians)
     check_finite(path, gaussians)
-    turned = half_turned(gaussians, OPENGL)
+    turned = convert_axes(gaussians, OPENGL)
     bits = _fractional_bits(path, turned.means)
     rest = turned.sh[:, 1:]
     with np.errstate(divide="ignore"):
@@ -51,11 +51,11 @@ def write_spz(path: Path, gaussians: Gaussians) -> list[str]:
     parts = [
         HEADER.pack(MAGIC, VERSION, len(turned), turned.sh_degree, bits, 0, 0),
         _pack_positions(turned.means, bits),
-        nearest_bytes(turned.opacities * 255),
-        nearest_bytes(turned.sh[:, 0] * COLOUR_STEPS + 127.5),
-        nearest_bytes((log_scales + LOG_SCALE_OFFSET) * LOG_SCALE_STEPS),
+        round_to_uint8(turned.opacities * 255),
+        round_to_uint8(turned.sh[:, 0] * COLOUR_STEPS + 127.5),
+        round_to_uint8((log_scales + LOG_SCALE_OFFSET) * LOG_SCALE_STEPS),
         _pack_rotations(turned.quats),
-        nearest_bytes(rest * SH_STEPS + SH_STEPS),
+        round_to_uint8(rest * SH_STEPS + SH_STEPS),
     ]
     compressor = zlib.compressobj(wbits=31)  # gzip's header and trailer
     with replacing(path) as temporary, temporary.open("wb") as file:
@@ -63,9 +63,9 @@ def write_spz(path: Path, gaussians: Gaussians) -> list[str]:
             file.write(compressor.compress(part if isinstance(part, bytes) else np.ascontiguousarray(part).data))
         file.write(compressor.flush())
     highest = np.exp(255 / LOG_SCALE_STEPS - LOG_SCALE_OFFSET)
-    notes = moved("scales", turned.scales, np.exp(-LOG_SCALE_OFFSET), highest)
-    notes += moved("spherical harmonics", rest, -1, SH_HIGHEST)
-    return notes + moved("colours", gaussians.colours, *_colour_range())
+    notes = clipped_note("scales", turned.scales, np.exp(-LOG_SCALE_OFFSET), highest)
+    notes += clipped_note("spherical harmonics", rest, -1, SH_HIGHEST)
+    return notes + clipped_note("colours", gaussians.colours, *_colour_range())
 
 
 def read_spz(path: Path) -> Gaussians:
@@ -88,7 +88,7 @@ def read_spz(path: Path) -> Gaussians:
         opacities=opacities[:, 0] / np.float32(255),
         sh=sh,
     )
-    return half_turned(gaussians, OPENGL)
+    return convert_axes(gaussians, OPENGL)
 
 
 def _fractional_bits(path: Path, means: np.ndarray) -> int:

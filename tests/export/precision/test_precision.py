@@ -8,7 +8,7 @@ import pytest
 from conftest import run_command
 from idesplat.export import cli
 from idesplat.export.stages import example_inputs
-from idesplat.runtime import Runner
+from idesplat.runtime import Predictor
 from idesplat.runtime.inference.metadata import INPUTS, OUTPUTS
 from onnx import TensorProto
 
@@ -35,7 +35,7 @@ def test_it_is_standard_and_says_what_it_is(lowered):
         onnx.checker.check_model(model, full_check=True)
         assert {node.domain for node in model.graph.node} == {""}
         assert [(opset.domain, opset.version) for opset in model.opset_import] == [("", 20)]
-    assert Runner(out).description.precision == precision
+    assert Predictor(out).metadata.precision == precision
 
 
 def test_inputs_and_outputs_stay_in_float32(lowered):
@@ -72,9 +72,9 @@ def test_it_predicts_nearly_the_same_in_one_file_and_in_stages(lowered, exported
     precision, out, staged = lowered
     inputs = example_inputs(3, 64, 96, 0.5, 100.0)
     arrays = [inputs[name].numpy() for name in INPUTS]
-    expected = Runner(exported[0]).predict_arrays(*arrays)
+    expected = Predictor(exported[0]).predict_arrays(*arrays)
     for path in (out, staged):
-        found = Runner(path).predict_arrays(*arrays)
+        found = Predictor(path).predict_arrays(*arrays)
         off = np.median(np.abs(1 / found.depth - 1 / expected.depth)) / (1 / expected.depth).std()
         assert 0 < off < {"int8": 0.2, "fp16": 0.01}[precision]
 

@@ -15,7 +15,7 @@ from idesplat.export.validation.cases import Case, verification_cases
 from idesplat.export.validation.compare import FUSED, NEAREST, STAGED, Exported, Figures, TensorError, compare
 from idesplat.export.validation.report import print_details, print_summary
 from idesplat.runtime.errors import InputError
-from idesplat.runtime.inference.metadata import INPUTS, read_description, read_manifest
+from idesplat.runtime.inference.metadata import INPUTS, read_manifest, read_metadata
 from onnx import helper, numpy_helper
 
 FAR_END = np.iinfo(np.int64).max
@@ -24,7 +24,7 @@ FAR_END = np.iinfo(np.int64).max
 @pytest.fixture(scope="module")
 def cases(exported):
     properties = {entry.key: entry.value for entry in onnx.load(exported[0]).metadata_props}
-    description = read_description(properties, exported[0])
+    description = read_metadata(properties, exported[0])
     return list(verification_cases(NamedTensors(small_network()), description, StaticShape()))
 
 

@@ -17,7 +17,7 @@ from idesplat.runtime.cli.render import main as render_main
 from idesplat.runtime.cli.view import main as view_main
 from idesplat.runtime.inference.inputs import pick_frames
 from idesplat.runtime.splats.formats.ply import read_ply
-from idesplat.runtime.splats.io import read_scene
+from idesplat.runtime.splats.io import read_splats
 from idesplat.runtime.system.files import replacing
 from idesplat.tools.synthetic.make_scene import make_scene
 
@@ -118,21 +118,21 @@ def test_staged_folder_and_a_list_of_files(workplace, exported):
 
 
 def test_cleaning_is_counted_and_formats_follow_the_name(workplace, capsys):
-    cleaning = ("--trim-border", "4", "--min-opacity", "0.01", "--merge-duplicates")
+    cleaning = ("--crop-border", "4", "--min-opacity", "0.01", "--merge-duplicates")
     arguments = (*USUAL[:-1], "scene.spz", "--json", "summary.json", *cleaning)
     assert run_command(main, *arguments) == 0
     summary = json.loads(Path("summary.json").read_text())
     left_out = summary["cleaned"]["left_out"]
-    assert list(left_out) == ["min_opacity", "trim_border", "merge_duplicates"]
-    assert left_out["trim_border"] > 0
-    left = len(read_scene(Path("scene.spz")))
+    assert list(left_out) == ["min_opacity", "crop_border", "merge_duplicates"]
+    assert left_out["crop_border"] > 0
+    left = len(read_splats(Path("scene.spz")))
     assert left == summary["gaussians"] == 2 * 64 * 96 - sum(left_out.values())
     assert f"{left:,} Gaussians left" in capsys.readouterr().out
 
 
 def test_points_and_surfaces_follow_the_name(workplace, capsys):
     for name, faces in (("scene.points.ply", False), ("scene.mesh.glb", True)):
-        assert run_command(main, *USUAL[:-1], name, *(["--trim-edges", "0.2"] if faces else [])) == 0
+        assert run_command(main, *USUAL[:-1], name, *(["--max-depth-jump", "0.2"] if faces else [])) == 0
         read = trimesh.load(name, force="scene").to_geometry()
         assert len(read.vertices) == 2 * 64 * 96
         assert hasattr(read, "faces") == faces
@@ -326,9 +326,9 @@ BAD = {
     "a surface without faint splats": (
         nothing,
         ("--out", "scene.mesh.ply", "--min-opacity", "0.1"),
-        "a surface knows --trim-edges alone",
+        "a surface knows --max-depth-jump alone",
     ),
-    "a border wider than the pictures": (nothing, ("--trim-border", "32"), "--trim-border 32"),
+    "a border wider than the pictures": (nothing, ("--crop-border", "32"), "--crop-border 32"),
     "an output that is no splat file": (nothing, ("--out", "scene.txt"), ".ply"),
     "an output folder that is a file": (nothing, ("--save-depth", "transforms.json"), "transforms.json"),
 }

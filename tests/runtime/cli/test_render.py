@@ -22,7 +22,7 @@ from idesplat.runtime.images.video_writer import open_video
 from idesplat.runtime.images.writing import save_depth_png, save_png
 from idesplat.runtime.rendering.cameras import around, fitted, overview
 from idesplat.runtime.rendering.rasterizer import rasterize
-from idesplat.runtime.rendering.render_view import draw_view
+from idesplat.runtime.rendering.render import render_view
 from idesplat.runtime.splats.formats.ply import read_ply, write_ply
 from idesplat.runtime.splats.gaussians import Gaussians
 
@@ -184,7 +184,7 @@ def test_importing_the_command_loads_nothing_heavy() -> None:
 def test_draw_view_takes_camera_to_world() -> None:
     extrinsics = pose((0.3, -0.5, 0.2), (1, 2, 3))
     ahead = extrinsics @ [0.1, -0.2, 2, 1]  # in the camera's own frame 2 ahead, a little right and up
-    drawn = draw_view(one_gaussian(tuple(ahead[:3]), (0, 1, 0)), extrinsics, pinhole(101, 81), 101, 81)
+    drawn = render_view(one_gaussian(tuple(ahead[:3]), (0, 1, 0)), extrinsics, pinhole(101, 81), 101, 81)
     # 50.5 + 101 * 0.1 / 2 = 55.55 and 40.5 - 101 * 0.2 / 2 = 30.4 are the pixels 55 and 30
     assert np.unravel_index(drawn.alpha.argmax(), (81, 101)) == (30, 55)
     assert drawn.depth[30, 55] / drawn.alpha[30, 55] == pytest.approx(2, abs=1e-5)
@@ -223,7 +223,7 @@ def psnr(drawn: np.ndarray, expected: np.ndarray) -> float:
 @pytest.mark.parametrize(("height", "width"), [(40, 60), (60, 40)])
 def test_an_overview_shows_all_of_the_scene_and_little_else(height: int, width: int) -> None:
     camera = overview(a_ball_of_gaussians(), height, width)
-    alpha = draw_view(a_ball_of_gaussians(), camera.extrinsics, camera.K, width, height).alpha
+    alpha = render_view(a_ball_of_gaussians(), camera.extrinsics, camera.K, width, height).alpha
     rows, columns = np.nonzero(alpha > 0.2)
     assert rows.min() > 0 and rows.max() < height - 1 and columns.min() > 0 and columns.max() < width - 1
     # It fits the sphere around the box, not the ball itself, hence with room to spare.
@@ -271,8 +271,8 @@ def test_another_size_shows_what_the_camera_showed() -> None:
     ball = a_ball_of_gaussians((0, 0, 4))
     camera = Camera("a", 60, 40, pinhole(60, 40), np.eye(4))
     wide = fitted(camera, 40, 100)
-    whole = draw_view(ball, wide.extrinsics, wide.K, 100, 40).rgb
-    own = draw_view(ball, camera.extrinsics, camera.K, 60, 40).rgb
+    whole = render_view(ball, wide.extrinsics, wide.K, 100, 40).rgb
+    own = render_view(ball, camera.extrinsics, camera.K, 60, 40).rgb
     np.testing.assert_allclose(whole[:, 20:80], own, atol=1e-5)
     half = fitted(camera, 20, 30)
     np.testing.assert_allclose(half.K, [[30, 0, 15], [0, 30, 10], [0, 0, 1]])
@@ -283,7 +283,7 @@ def test_a_still_without_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert run(monkeypatch, tmp_path / "scene.ply", "--out", tmp_path / "still.png", "--size", "48x64") == 0
     picture = read_rgb(tmp_path / "still.png")
     camera = overview(a_ball_of_gaussians(), 48, 64)
-    expected = draw_view(a_ball_of_gaussians(), camera.extrinsics, camera.K, 64, 48).rgb
+    expected = render_view(a_ball_of_gaussians(), camera.extrinsics, camera.K, 64, 48).rgb
     assert psnr(picture, expected) > 45
     assert {path.name for path in tmp_path.iterdir()} == {"scene.ply", "still.png"}
 
@@ -318,10 +318,10 @@ def test_an_orbit_as_a_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ca
         assert frames.shape == (6, 98, 128, 3)  # videos have even sides
         assert fps == pytest.approx(12)
     for index, shot in enumerate(shots):
-        drawn = draw_view(ball, shot.extrinsics, shot.K, 128, 97)
+        drawn = render_view(ball, shot.extrinsics, shot.K, 128, 97)
         assert psnr(films[""][0][index][:97], drawn.rgb) > 25
         assert psnr(films["-alpha"][0][index][:97], np.repeat(drawn.alpha[..., None], 3, axis=2)) > 25
-    assert psnr(films[""][0][3][:97], draw_view(ball, shots[0].extrinsics, shots[0].K, 128, 97).rgb) < 25
+    assert psnr(films[""][0][3][:97], render_view(ball, shots[0].extrinsics, shots[0].K, 128, 97).rgb) < 25
     assert "orbit-depth.mp4" in capsys.readouterr().out
 
 
@@ -347,7 +347,7 @@ def test_a_path_through_the_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         f"frame-{index:04d}.png" for index in range(5)
     ]
     for index, x in enumerate((0, 0.5, 1, 1.5, 2)):
-        expected = draw_view(ball, pose((0, 0, 0), (x, 0, -4)), pinhole(40, 30), 40, 30).rgb
+        expected = render_view(ball, pose((0, 0, 0), (x, 0, -4)), pinhole(40, 30), 40, 30).rgb
         assert psnr(read_rgb(tmp_path / "out" / f"frame-{index:04d}.png"), expected) > 45
 
 
@@ -451,7 +451,7 @@ def test_folders_are_made_and_left_only_with_what_they_are_for(
     def fails(*arguments: object) -> None:
         raise InputError("it cannot be drawn")
 
-    monkeypatch.setattr(render, "draw_view", fails)
+    monkeypatch.setattr(render, "render_view", fails)
     for out in ("other/one/a.mp4", "other/a.png", "other/folder"):
         assert run(monkeypatch, "scene.ply", "--size", "24x32", "--out", out) == 2
         assert "it cannot be drawn" in capsys.readouterr().err

@@ -16,7 +16,7 @@ from idesplat.runtime.cli.view import main, read_viewpoints
 from idesplat.runtime.geometry.quaternions import quaternions_from_matrices
 from idesplat.runtime.images.writing import save_png
 from idesplat.runtime.rendering.cameras import overview
-from idesplat.runtime.rendering.render_view import draw_view
+from idesplat.runtime.rendering.render import render_view
 from idesplat.runtime.splats.formats.ply import write_ply
 from idesplat.runtime.splats.gaussians import Gaussians, with_colours
 from idesplat.tools.evaluation.metrics import ssim
@@ -64,7 +64,7 @@ def gaussians(camera: Camera) -> Gaussians:
 @pytest.fixture(scope="module")
 def drawn(camera: Camera, gaussians: Gaussians) -> np.ndarray:
     """What the camera sees, by the rasteriser."""
-    return draw_view(gaussians, camera.extrinsics, camera.K, WIDTH, HEIGHT, WHITE).rgb
+    return render_view(gaussians, camera.extrinsics, camera.K, WIDTH, HEIGHT, WHITE).rgb
 
 
 @pytest.fixture(scope="module")
@@ -174,7 +174,7 @@ def test_a_click_at_a_camera_leads_there(opened, served, folder, gaussians, draw
     rows, columns = magenta(page.scene(drawn[:, :FREE])).nonzero()
     page.page.mouse.click(float(np.median(columns)), float(np.median(rows)))  # through the photograph of the first
     right = read_cameras(folder / "cameras.json")[1]
-    there = draw_view(gaussians, right.extrinsics, right.K, WIDTH, HEIGHT, WHITE).rgb
+    there = render_view(gaussians, right.extrinsics, right.K, WIDTH, HEIGHT, WHITE).rgb
     assert similarity(there, drawn) < TURNED
     shows(page.scene(there), there)
     assert page.complaints == []
@@ -214,7 +214,7 @@ def test_scene_without_cameras(opened, folder, gaussians, tmp_path):
     html = tmp_path / "scene.html"
     assert run_command(main, folder / "scene.ply", "--html", html) == 0
     above = overview(gaussians, HEIGHT, WIDTH)
-    drawn = draw_view(gaussians, above.extrinsics, above.K, WIDTH, HEIGHT, WHITE).rgb
+    drawn = render_view(gaussians, above.extrinsics, above.K, WIDTH, HEIGHT, WHITE).rgb
     shows(opened(html.as_uri()).scene(drawn), drawn)
 
 

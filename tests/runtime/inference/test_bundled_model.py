@@ -2,35 +2,35 @@
 
 import numpy as np
 import pytest
-from idesplat.runtime import InputError, Runner, read_cameras
-from idesplat.runtime.inference import bundled_model as default_model
+from idesplat.runtime import InputError, Predictor, read_cameras
+from idesplat.runtime.inference import bundled_model as module
 from idesplat.runtime.views.batch import prepare
 
 LARGEST = 16_000_000  # bytes
 
 
 def test_is_small_and_says_what_it_was_trained_on():
-    path = default_model.default_model()
+    path = module.bundled_model()
     assert path.stat().st_size <= LARGEST
-    own = Runner(path).description
+    own = Predictor(path).metadata
     assert (own.preset, own.height, own.width, own.near) == ("idesplat-tiny", 256, 256, 1.0)
     assert own.trained_views == [2, 3] and own.trained_sides == [128, 256]
     assert own.fixed_views == 0 and not own.fixed_size
 
 
 def test_damaged_or_missing_is_refused(tmp_path, monkeypatch):
-    source = default_model.FOLDER
-    monkeypatch.setattr(default_model, "FOLDER", tmp_path)
+    source = module.FOLDER
+    monkeypatch.setattr(module, "FOLDER", tmp_path)
     with pytest.raises(InputError, match=r"cannot be read .*install idesplat again"):
-        default_model.default_model()
+        module.bundled_model()
     for file in source.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
-    assert default_model.default_model() == tmp_path / default_model.NAME
-    content = bytearray((tmp_path / default_model.NAME).read_bytes())
+    assert module.bundled_model() == tmp_path / module.NAME
+    content = bytearray((tmp_path / module.NAME).read_bytes())
     content[len(content) // 2] ^= 1
-    (tmp_path / default_model.NAME).write_bytes(content)
+    (tmp_path / module.NAME).write_bytes(content)
     with pytest.raises(InputError, match=r"is damaged .*give --model"):
-        default_model.default_model()
+        module.bundled_model()
 
 
 def test_finds_depth_far_better_than_one_plane_does(scene):
@@ -39,9 +39,9 @@ def test_finds_depth_far_better_than_one_plane_does(scene):
     pairs = [(scene / cameras[view].name, cameras[view]) for view in (1, 3)]
     height, width = cameras[0].height, cameras[0].width
     views = prepare(pairs, None, height, width)
-    runner = Runner(default_model.default_model())
-    span = runner.depth_range(views)
-    found = runner.predict_arrays(views.images, views.extrinsics, views.intrinsics, span.near, span.far).depth
+    predictor = Predictor(module.bundled_model())
+    span = predictor.depth_range(views)
+    found = predictor.predict_arrays(views.images, views.extrinsics, views.intrinsics, span.near, span.far).depth
     truth = np.stack([np.load(scene / "depth" / f"{view:03}.npz")["depth"] for view in (1, 3)])
     error = np.abs(found / truth - 1).mean()
     constants = np.linspace(truth.min(), truth.max(), 200)

@@ -12,14 +12,14 @@ import onnx.parser
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from idesplat.runtime import InputError, Runner
+from idesplat.runtime import InputError, Predictor
 from idesplat.runtime.inference.metadata import (
     MANIFEST_NAME,
     METADATA_KEY,
     MOST_STAGES,
     StageFile,
-    read_description,
     read_manifest,
+    read_metadata,
     write_manifest,
 )
 from idesplat.runtime.inference.session import open_session, run_limit_s, run_session
@@ -34,7 +34,7 @@ def one_line(error: pytest.ExceptionInfo[InputError]) -> str:
 
 
 def test_the_network_of_these_tests_is_one(tmp_path: Path) -> None:
-    prediction = Runner(write_model(tmp_path / "model.onnx")).predict_arrays(**arrays(), near=1, far=10)
+    prediction = Predictor(write_model(tmp_path / "model.onnx")).predict_arrays(**arrays(), near=1, far=10)
     assert prediction.depth.shape == (2, 32, 48)
     assert len(prediction.need_gaussians()) == 2 * 32 * 48
 
@@ -55,7 +55,7 @@ HUGE = st.sampled_from((10**400, -(10**400), float("nan"), float("inf"), "\x00",
 def test_a_field_of_metadata_is_right_or_refused(field: str, value: object) -> None:
     content = asdict(OWN) | {field: value}
     try:
-        read = read_description({METADATA_KEY: json.dumps(content)}, Path("model.onnx"))
+        read = read_metadata({METADATA_KEY: json.dumps(content)}, Path("model.onnx"))
     except InputError as error:
         assert str(error).startswith("model.onnx: damaged metadata: ") and "\n" not in str(error)
         return
@@ -73,7 +73,7 @@ def test_a_field_of_metadata_is_right_or_refused(field: str, value: object) -> N
 def test_metadata_of_any_kind_is_refused(content: object) -> None:
     text = content if isinstance(content, str) else json.dumps(content)
     with pytest.raises(InputError, match="damaged metadata"):
-        read_description({METADATA_KEY: text}, Path("model.onnx"))
+        read_metadata({METADATA_KEY: text}, Path("model.onnx"))
 
 
 BAD_METADATA = {
@@ -95,7 +95,7 @@ BAD_METADATA = {
 def test_damaged_metadata(name: str) -> None:
     text, expected = BAD_METADATA[name]
     with pytest.raises(InputError, match=expected) as error:
-        read_description({METADATA_KEY: text}, Path("model.onnx"))
+        read_metadata({METADATA_KEY: text}, Path("model.onnx"))
     one_line(error)
 
 
@@ -104,7 +104,7 @@ def test_names_of_a_graph_that_are_not_utf8(tmp_path: Path, name: str) -> None:
     path = write_model(tmp_path / "model.onnx")
     path.write_bytes(path.read_bytes().replace(name.encode(), b"\xff" + name[1:].encode()))
     with pytest.raises(InputError, match=r"model\.onnx: ") as error:
-        Runner(path)
+        Predictor(path)
     one_line(error)
 
 
@@ -179,7 +179,7 @@ def test_damaged_manifests(staged: Path, name: str) -> None:
     content, expected = BAD_MANIFESTS[name]
     (staged / MANIFEST_NAME).write_text(json.dumps(content))
     with pytest.raises(InputError, match=expected) as error:
-        Runner(staged)
+        Predictor(staged)
     one_line(error)
 
 
@@ -187,7 +187,7 @@ def test_damaged_manifests(staged: Path, name: str) -> None:
 def test_a_manifest_that_is_no_json(staged: Path, content: bytes) -> None:
     (staged / MANIFEST_NAME).write_bytes(content)
     with pytest.raises(InputError, match=r"manifest\.json") as error:
-        Runner(staged)
+        Predictor(staged)
     one_line(error)
 
 
@@ -227,7 +227,7 @@ BAD_GRAPHS = {
 def test_graphs_that_are_not_what_their_metadata_says(tmp_path: Path, name: str) -> None:
     text, changes, expected = BAD_GRAPHS[name]
     with pytest.raises(InputError, match=expected) as error:
-        Runner(write_model(tmp_path / "model.onnx", text, **changes))
+        Predictor(write_model(tmp_path / "model.onnx", text, **changes))
     assert "not what its metadata says" in one_line(error)
 
 
@@ -240,12 +240,12 @@ def test_stages_that_are_not_what_the_manifest_says(exported: tuple[Path, Path],
     files = [names[0], names[2], names[1], *names[3:]]
     write_manifest(folder, [StageFile(s.name, f, s.inputs, s.outputs) for s, f in zip(stages, files, strict=True)])
     with pytest.raises(InputError, match="not what its metadata says: by the") as error:
-        Runner(folder)
+        Predictor(folder)
     one_line(error)
     last = stages[-1]
     write_manifest(folder, [*stages[:-1], StageFile(last.name, last.file, last.inputs, [*last.outputs, "more"])])
     with pytest.raises(InputError, match="by the manifest it yields 'more', by the graph it does not"):
-        Runner(folder)
+        Predictor(folder)
 
 
 BAD_RESULTS = {
@@ -279,9 +279,9 @@ BAD_RESULTS = {
 def test_what_goes_wrong_while_a_graph_runs(tmp_path: Path, name: str, capfd: pytest.CaptureFixture[str]) -> None:
     old, new, expected = BAD_RESULTS[name]
     assert old in NETWORK
-    runner = Runner(write_model(tmp_path / "model.onnx", NETWORK.replace(old, new)))
+    predictor = Predictor(write_model(tmp_path / "model.onnx", NETWORK.replace(old, new)))
     with pytest.raises(InputError, match=expected) as error:
-        runner.predict_arrays(**arrays(), near=1, far=10)
+        predictor.predict_arrays(**arrays(), near=1, far=10)
     assert one_line(error).startswith(f"{tmp_path / 'model.onnx'}: ")
     assert capfd.readouterr().err == ""
 
@@ -316,10 +316,10 @@ def test_the_limit_is_the_environments(tmp_path: Path, monkeypatch: pytest.Monke
             b = Sqrt (a)
         }>""",
     )
-    runner = Runner(write_model(tmp_path / "model.onnx", body))
+    predictor = Predictor(write_model(tmp_path / "model.onnx", body))
     monkeypatch.setenv("IDESPLAT_RUN_LIMIT", "0.3")
     with pytest.raises(InputError, match=r"model\.onnx: the graph did not end within 0.3 s"):
-        runner.predict_arrays(**arrays(), near=1, far=10)
+        predictor.predict_arrays(**arrays(), near=1, far=10)
     for text in ("soon", "-1", "0", "nan", "inf"):
         monkeypatch.setenv("IDESPLAT_RUN_LIMIT", text)
         with pytest.raises(InputError, match=f"IDESPLAT_RUN_LIMIT is {text}: expected the seconds"):
@@ -362,7 +362,7 @@ def test_weights_outside_the_folder_are_not_read(tmp_path: Path, location: str, 
     (folder / "link.bin").symlink_to(tmp_path / "secret.bin")
     os.mkfifo(folder / "pipe.bin")
     with pytest.raises(InputError, match=expected) as error:
-        Runner(external_model(folder / "model.onnx", location))
+        Predictor(external_model(folder / "model.onnx", location))
     one_line(error)
 
 
@@ -374,13 +374,13 @@ def test_files_that_are_no_graphs(tmp_path: Path, capfd: pytest.CaptureFixture[s
         path = tmp_path / f"{name}.onnx"
         path.write_bytes(content)
         with pytest.raises(InputError, match=rf"{name}\.onnx: ") as error:
-            Runner(path)
+            Predictor(path)
         one_line(error)
     with (tmp_path / "large.onnx").open("wb") as file:
         file.truncate(100 << 30)
     with pytest.raises(InputError, match=r"large\.onnx: has 100 GiB, expected a graph of less than 2 GiB"):
-        Runner(tmp_path / "large.onnx")
+        Predictor(tmp_path / "large.onnx")
     os.mkfifo(tmp_path / "pipe.onnx")
     with pytest.raises(InputError, match=r"pipe\.onnx: is no regular file"):
-        Runner(tmp_path / "pipe.onnx")
+        Predictor(tmp_path / "pipe.onnx")
     assert capfd.readouterr().err == ""

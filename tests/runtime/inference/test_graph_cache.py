@@ -9,7 +9,7 @@ import onnxruntime
 import pytest
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.inference import graph_cache, session
-from idesplat.runtime.inference.graph_cache import place_for
+from idesplat.runtime.inference.graph_cache import cache_entry
 from idesplat.runtime.inference.session import open_session, run_session
 from onnx import TensorProto, helper, numpy_helper
 
@@ -124,7 +124,7 @@ def test_a_damaged_or_foreign_entry_is_made_anew(cache, model, damage, monkeypat
 
 def test_an_entry_that_cannot_be_loaded_is_removed(cache, model):
     """Its name proves its content, and the content is no graph."""
-    place_for(model).fill(lambda path: path.write_bytes(b"no graph"))
+    cache_entry(model).put(lambda path: path.write_bytes(b"no graph"))
     assert len(entries(cache)) == 1
     np.testing.assert_array_equal(run_session(open_session(model), FEEDS)["y"], plain(model))
     assert entries(cache) == []
@@ -134,7 +134,7 @@ def test_an_entry_that_cannot_be_loaded_is_removed(cache, model):
 def test_without_a_folder_to_write_it_runs_all_the_same(model, tmp_path, below, monkeypatch):
     (tmp_path / "a file").touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / below))
-    assert place_for(model) is None
+    assert cache_entry(model) is None
     np.testing.assert_array_equal(run_session(open_session(model), FEEDS)["y"], plain(model))
 
 
@@ -155,7 +155,7 @@ def test_a_write_that_fails_leaves_nothing(cache, model, monkeypatch):
     def full(*arguments):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(graph_cache.Place, "_name", full)
+    monkeypatch.setattr(graph_cache.CacheEntry, "_name", full)
     np.testing.assert_array_equal(run_session(open_session(model), FEEDS)["y"], plain(model))
     assert entries(cache) == []
 
@@ -176,9 +176,9 @@ def test_a_model_that_cannot_be_loaded_leaves_nothing(cache, tmp_path):
     ],
 )
 def test_what_was_made_elsewhere_is_not_used(cache, model, where, name, value, monkeypatch):
-    here = place_for(model)
+    here = cache_entry(model)
     monkeypatch.setattr(where, name, value)
-    assert place_for(model).key != here.key
+    assert cache_entry(model).key != here.key
 
 
 def test_a_model_that_changes_gets_an_entry_of_its_own(cache, model):
@@ -201,7 +201,7 @@ def test_weights_in_other_files_are_never_stale(cache, tmp_path):
 
 def test_very_large_models_are_not_kept(cache, model, monkeypatch):
     monkeypatch.setattr(graph_cache, "LARGEST_MODEL", model.stat().st_size - 1)
-    assert place_for(model) is None
+    assert cache_entry(model) is None
 
 
 def test_the_cache_stays_small_and_keeps_what_is_used(cache, tmp_path, monkeypatch):
@@ -212,7 +212,7 @@ def test_the_cache_stays_small_and_keeps_what_is_used(cache, tmp_path, monkeypat
     monkeypatch.setattr(graph_cache, "LARGEST_CACHE", 2 * size + 100)
     open_session(models[0])  # now the second is the one that was not used for longest
     open_session(models[2])
-    kept = [place_for(model).find() is not None for model in models]
+    kept = [cache_entry(model).get() is not None for model in models]
     assert kept == [True, False, True]
 
 
@@ -222,14 +222,14 @@ def test_sessions_opened_at_once_do_not_disturb_each_other(cache, model):
     for opened in sessions:
         np.testing.assert_array_equal(run_session(opened, FEEDS)["y"], plain(model))
     assert len(entries(cache)) == 1
-    assert entries(cache)[0] == place_for(model).find()
+    assert entries(cache)[0] == cache_entry(model).get()
 
 
 def test_a_session_keeps_to_the_cores_that_the_process_may_use(model, monkeypatch):
     """Left to itself, ONNX Runtime pins threads to the others, too."""
     monkeypatch.setattr(session.os, "cpu_count", lambda: 64)
     monkeypatch.setattr(session, "usable_cores", lambda: 3)
-    assert session._options(session.USUAL).intra_op_num_threads == 3
-    assert session._options(session.Tuning(threads=2)).intra_op_num_threads == 2
+    assert session._options(session.DEFAULT).intra_op_num_threads == 3
+    assert session._options(session.SessionConfig(threads=2)).intra_op_num_threads == 2
     monkeypatch.setattr(session, "usable_cores", lambda: 64)
-    assert session._options(session.USUAL).intra_op_num_threads == session.AS_MANY_AS_CORES
+    assert session._options(session.DEFAULT).intra_op_num_threads == session.AS_MANY_AS_CORES

@@ -8,7 +8,7 @@ import onnxruntime
 import pytest
 from conftest import run_command
 from idesplat.export.stages import example_inputs
-from idesplat.runtime import Runner
+from idesplat.runtime import Predictor
 from idesplat.runtime.cli import infer as cli
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.inference import openvino
@@ -60,7 +60,7 @@ def test_it_is_chosen_by_name(name, monkeypatch):
 def test_without_a_processor_that_it_takes_it_is_refused(others, found, exported):
     found(*others)
     with pytest.raises(InputError, match=r"^OpenVINO's plug-in runs on Intel's processors alone, .* --provider CPU$"):
-        Runner(exported[0], "OpenVINO")
+        Predictor(exported[0], "OpenVINO")
 
 
 def test_a_plug_in_that_cannot_be_loaded_is_refused_in_one_line(monkeypatch, exported):
@@ -69,7 +69,7 @@ def test_a_plug_in_that_cannot_be_loaded_is_refused_in_one_line(monkeypatch, exp
 
     monkeypatch.setattr(openvino, "_register", fail)
     with pytest.raises(InputError, match=r"^OpenVINO's plug-in cannot be loaded \(no such library\); use .*CPU$"):
-        Runner(exported[0], "OpenVINO")
+        Predictor(exported[0], "OpenVINO")
 
 
 @pytest.mark.parametrize("threads", [0, 3])
@@ -86,12 +86,12 @@ def test_it_computes_in_float32_on_the_processor(threads, found):
 def test_it_computes_the_same(exported):
     pytest.importorskip(openvino.PACKAGE)
     try:
-        runner = Runner(exported[0], "OpenVINO")
+        predictor = Predictor(exported[0], "OpenVINO")
     except InputError as error:
         pytest.skip(str(error))  # on a processor that is not Intel's
     inputs = example_inputs(3, 64, 96, 0.5, 100.0)
     arrays = [inputs[name].numpy() for name in INPUTS]
-    expected, found = Runner(exported[0]).predict_arrays(*arrays), runner.predict_arrays(*arrays)
+    expected, found = Predictor(exported[0]).predict_arrays(*arrays), predictor.predict_arrays(*arrays)
     for name in ("means", "scales", "opacities", "sh"):
         ours, theirs = getattr(expected.gaussians, name), getattr(found.gaussians, name)
         assert np.median(np.abs(theirs - ours)) < 1e-4 * ours.std(), name

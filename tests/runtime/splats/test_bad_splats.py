@@ -19,7 +19,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.splats.gaussians import Gaussians
-from idesplat.runtime.splats.io import FORMATS, read_scene, write_scene
+from idesplat.runtime.splats.io import FORMATS, read_splats, write_splats
 from splat_cases import (
     ARRAYS,
     DATA,
@@ -44,7 +44,7 @@ def written(tmp_path_factory: pytest.TempPathFactory, truth: Gaussians) -> dict[
     folder = tmp_path_factory.mktemp("written")
     small = Gaussians(*(getattr(truth, name)[:5] for name in ARRAYS))
     for suffix in FORMATS:
-        write_scene(folder / f"scene{suffix}", small)
+        write_splats(folder / f"scene{suffix}", small)
     files = {suffix: (folder / f"scene{suffix}").read_bytes() for suffix in FORMATS}
     return files | {VERSION_4: (DATA / VERSION_4).read_bytes()}
 
@@ -54,7 +54,7 @@ def read_or_refuse(path: Path) -> Gaussians | None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         try:
-            gaussians = read_scene(path)
+            gaussians = read_splats(path)
         except InputError as error:
             assert str(path) in str(error)
             assert "\n" not in str(error)
@@ -94,7 +94,7 @@ def test_values_that_are_not_numbers_are_not_written(tmp_path: Path, truth: Gaus
     broken = Gaussians(*(getattr(truth, name).copy() for name in ARRAYS))
     getattr(broken, field)[17, ...] = np.nan
     with pytest.raises(InputError, match=r"Gaussian 17 is not"):
-        write_scene(path, broken)
+        write_splats(path, broken)
     assert path.read_bytes() == b"the result of yesterday"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -122,7 +122,7 @@ def test_broken_spz_files_are_named(tmp_path: Path, name: str) -> None:
     path = tmp_path / "broken.spz"
     path.write_bytes(content)
     with pytest.raises(InputError, match=message):
-        read_scene(path)
+        read_splats(path)
 
 
 def zstd_spz(count: int, unpacked: int) -> bytes:
@@ -138,24 +138,24 @@ def test_a_zstd_bomb_does_not_go_off(tmp_path: Path) -> None:
     path = tmp_path / "bomb.spz"
     path.write_bytes(zstd_spz(3, 300_000_000))
     tracemalloc.start()
-    assert len(read_scene(path)) == 3
+    assert len(read_splats(path)) == 3
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 20_000_000
     path.write_bytes(zstd_spz(3, 26))
     with pytest.raises(InputError, match="cut short: stream 0 needs 27 bytes"):
-        read_scene(path)
+        read_splats(path)
     damaged = bytearray(zstd_spz(3, 27))
     damaged[32 + 5 * 16 : 32 + 5 * 16 + 4] = b"none"
     path.write_bytes(damaged)
     with pytest.raises(InputError, match="stream 0 is damaged"):
-        read_scene(path)
+        read_splats(path)
 
 
 def test_without_zstandard_the_remedy_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "zstandard", None)
     with pytest.raises(InputError, match=r'v4.spz: .spz of version 4 .*; pip install "idesplat\[spz\]"'):
-        read_scene(DATA / VERSION_4)
+        read_splats(DATA / VERSION_4)
 
 
 def test_a_bomb_does_not_go_off(tmp_path: Path) -> None:
@@ -169,7 +169,7 @@ def test_a_bomb_does_not_go_off(tmp_path: Path) -> None:
     path.write_bytes(content)
     tracemalloc.start()
     with pytest.raises(InputError, match="claim to hold 200000000 are no scene"):
-        read_scene(path)
+        read_splats(path)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 2 * len(content) + 1e6
@@ -244,7 +244,7 @@ def test_broken_sog_files_are_named(tmp_path: Path, written: dict[str, bytes], n
     path.write_bytes(sog(written[".sog"], change))
     with warnings.catch_warnings(), pytest.raises(InputError, match=message) as caught:
         warnings.simplefilter("error")
-        read_scene(path)
+        read_splats(path)
     assert str(path) in str(caught.value)
 
 
@@ -254,7 +254,7 @@ def test_a_bomb_in_an_archive_does_not_go_off(tmp_path: Path, written: dict[str,
     with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("more.webp", bytes(90_000_000))
     with pytest.raises(InputError, match=r"bomb.sog: \d+ bytes that claim to hold 900\d+ are no scene"):
-        read_scene(path)
+        read_splats(path)
 
 
 def test_a_picture_of_one_colour_is_no_scene(tmp_path: Path, written: dict[str, bytes]) -> None:
@@ -274,7 +274,7 @@ def test_a_picture_of_one_colour_is_no_scene(tmp_path: Path, written: dict[str, 
     path.write_bytes(sog(written[".sog"], blow_up))
     assert path.stat().st_size < 60_000
     with pytest.raises(InputError, match=r"flat.sog: \d+ bytes that claim to hold \d+ .*IDESPLAT_MAX_EXPANSION"):
-        read_scene(path)
+        read_splats(path)
 
 
 def test_a_directory_that_lies_of_sizes_does_not_fill_memory(tmp_path: Path, written: dict[str, bytes]) -> None:
@@ -290,7 +290,7 @@ def test_a_directory_that_lies_of_sizes_does_not_fill_memory(tmp_path: Path, wri
     path.write_bytes(content)
     tracemalloc.start()
     with pytest.raises(InputError, match=r"lie\.sog"):
-        read_scene(path)
+        read_splats(path)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 30e6
@@ -329,7 +329,7 @@ def test_broken_glb_files_are_named(tmp_path: Path, written: dict[str, bytes], n
     path = tmp_path / "broken.glb"
     path.write_bytes(glb(written[".glb"], change))
     with pytest.raises(InputError, match=message) as caught:
-        read_scene(path)
+        read_splats(path)
     assert str(path) in str(caught.value)
 
 

@@ -11,8 +11,8 @@ from idesplat.runtime.geometry.consistency import confidence, depth_jumps
 from idesplat.runtime.geometry.quaternions import quaternions_from_matrices, rotation_matrices
 from idesplat.runtime.geometry.sh import SH_0
 from idesplat.runtime.images.io import load_image
-from idesplat.runtime.rendering.render_view import draw_view
-from idesplat.runtime.splats.filtering import Cleaning, clean, describe
+from idesplat.runtime.rendering.render import render_view
+from idesplat.runtime.splats.filtering import FilterOptions, describe_removed, filter_gaussians
 from idesplat.runtime.splats.gaussians import Gaussians
 from idesplat.runtime.splats.merging import merged
 from idesplat.runtime.splats.points import points_from_depth
@@ -52,9 +52,10 @@ def wall(distance: float = 2.0) -> np.ndarray:
 
 
 def test_nothing_is_asked_for_by_default() -> None:
-    assert Cleaning().asked == []
+    assert FilterOptions().enabled == []
     gaussians = one_a_pixel(wall(), poses(0, 0.5))
-    left, taken = clean(gaussians, wall(), poses(0, 0.5), INTRINSICS, Cleaning())
+    filters = FilterOptions()
+    left, taken = filter_gaussians(gaussians, wall(), poses(0, 0.5), INTRINSICS, filters)
     assert taken == {}
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(left, name), getattr(gaussians, name))
@@ -64,15 +65,18 @@ def test_faint_gaussians() -> None:
     gaussians = one_a_pixel(wall(), poses(0, 0.5))
     gaussians.opacities[[3, 200]] = 0.04
     gaussians.opacities[7] = 0.05
-    left, taken = clean(gaussians, wall(), poses(0, 0.5), INTRINSICS, Cleaning(min_opacity=np.float32(0.05)))
+    left, taken = filter_gaussians(
+        gaussians, wall(), poses(0, 0.5), INTRINSICS, FilterOptions(min_opacity=np.float32(0.05))
+    )
     assert taken == {"min_opacity": 2}
     assert sorted(set(range(2 * HEIGHT * WIDTH)) - set(numbers(left))) == [3, 200]
 
 
 def test_borders() -> None:
     gaussians = one_a_pixel(wall(), poses(0, 0.5))
-    left, taken = clean(gaussians, wall(), poses(0, 0.5), INTRINSICS, Cleaning(trim_border=2))
-    assert taken == {"trim_border": 2 * (HEIGHT * WIDTH - (HEIGHT - 4) * (WIDTH - 4))}
+    filters = FilterOptions(crop_border=2)
+    left, taken = filter_gaussians(gaussians, wall(), poses(0, 0.5), INTRINSICS, filters)
+    assert taken == {"crop_border": 2 * (HEIGHT * WIDTH - (HEIGHT - 4) * (WIDTH - 4))}
     rows, columns = np.divmod(np.array(numbers(left)) % (HEIGHT * WIDTH), WIDTH)
     assert (rows.min(), rows.max(), columns.min(), columns.max()) == (2, HEIGHT - 3, 2, WIDTH - 3)
 
@@ -85,8 +89,10 @@ def test_depth_edges() -> None:
     np.testing.assert_allclose(jumps[0, :, 1:-1], 1.01**2 - 1, atol=1e-5)
     np.testing.assert_allclose(jumps[1, :, 7:9], 0.25, atol=1e-6)
     assert not jumps[1, :, :7].any() and not jumps[1, :, 9:].any()
-    left, taken = clean(one_a_pixel(depth, poses(0, 0.5)), depth, poses(0, 0.5), INTRINSICS, Cleaning(trim_edges=0.1))
-    assert taken == {"trim_edges": 2 * HEIGHT}
+    left, taken = filter_gaussians(
+        one_a_pixel(depth, poses(0, 0.5)), depth, poses(0, 0.5), INTRINSICS, FilterOptions(max_depth_jump=0.1)
+    )
+    assert taken == {"max_depth_jump": 2 * HEIGHT}
     assert not {HEIGHT * WIDTH + 7, HEIGHT * WIDTH + 8} & set(numbers(left))
 
 
@@ -102,8 +108,10 @@ def test_confidence_worked_by_hand() -> None:
     np.testing.assert_array_equal(
         given, expected
     )  # and of the wall behind, which the first does not see, it says nothing
-    left, taken = clean(one_a_pixel(depth, extrinsics), depth, extrinsics, INTRINSICS, Cleaning(min_confidence=0.5))
-    assert taken == {"min_confidence": 16}
+    left, taken = filter_gaussians(
+        one_a_pixel(depth, extrinsics), depth, extrinsics, INTRINSICS, FilterOptions(min_consistency=0.5)
+    )
+    assert taken == {"min_consistency": 16}
     assert len(left) == 2 * HEIGHT * WIDTH - 16
 
 
@@ -126,10 +134,11 @@ def test_the_same_surface_is_merged_once() -> None:
     """The second camera sees 12 of its 16 columns where the first does, pixel on pixel."""
     extrinsics = poses(0, 0.5)
     gaussians = one_a_pixel(wall(), extrinsics, opacity=0.5)
-    left, taken = clean(gaussians, wall(), extrinsics, INTRINSICS, Cleaning(merge_duplicates=True))
+    filters = FilterOptions(merge_duplicates=True)
+    left, taken = filter_gaussians(gaussians, wall(), extrinsics, INTRINSICS, filters)
     assert taken == {"merge_duplicates": HEIGHT * 12}
     assert len(left) == HEIGHT * WIDTH + HEIGHT * 4
-    first, second = left.taken(np.arange(HEIGHT * WIDTH)), left.taken(np.arange(HEIGHT * WIDTH, len(left)))
+    first, second = left.select(np.arange(HEIGHT * WIDTH)), left.select(np.arange(HEIGHT * WIDTH, len(left)))
     np.testing.assert_allclose(first.means, gaussians.means[: HEIGHT * WIDTH], atol=1e-6)
     opacities = first.opacities.reshape(HEIGHT, WIDTH)
     np.testing.assert_allclose(opacities[:, 4:], 1 - 0.5**2, atol=1e-6)  # what two let through, one behind the other
@@ -144,7 +153,9 @@ def test_what_was_left_out_before_is_not_merged_into() -> None:
     extrinsics = poses(0, 0.5)
     gaussians = one_a_pixel(wall(), extrinsics)
     gaussians.opacities[: HEIGHT * WIDTH] = 0.01
-    left, taken = clean(gaussians, wall(), extrinsics, INTRINSICS, Cleaning(min_opacity=0.02, merge_duplicates=True))
+    left, taken = filter_gaussians(
+        gaussians, wall(), extrinsics, INTRINSICS, FilterOptions(min_opacity=0.02, merge_duplicates=True)
+    )
     assert taken == {"min_opacity": HEIGHT * WIDTH, "merge_duplicates": 0}
     assert numbers(left) == list(range(HEIGHT * WIDTH, 2 * HEIGHT * WIDTH))
 
@@ -185,7 +196,7 @@ def test_quaternions_and_matrices() -> None:
 
 
 def test_the_line_names_and_counts() -> None:
-    line = describe({"min_opacity": 1234, "merge_duplicates": 5}, 100_000)
+    line = describe_removed({"min_opacity": 1234, "merge_duplicates": 5}, 100_000)
     assert line == "cleaned: 1,234 too faint, 5 merged into another view's; 100,000 Gaussians left"
 
 
@@ -194,16 +205,16 @@ def test_the_line_names_and_counts() -> None:
     [
         ({"min_opacity": 1.5}, "--min-opacity 1.5: expected a number from 0 to 1"),
         ({"min_opacity": float("nan")}, "--min-opacity nan"),
-        ({"min_confidence": -1}, "--min-confidence -1"),
-        ({"trim_border": -3}, "--trim-border -3"),
-        ({"trim_edges": float("nan")}, "--trim-edges nan"),
-        ({"trim_border": 6}, "nothing is left of 12x16 pixels"),
+        ({"min_consistency": -1}, "--min-consistency -1"),
+        ({"crop_border": -3}, "--crop-border -3"),
+        ({"max_depth_jump": float("nan")}, "--max-depth-jump nan"),
+        ({"crop_border": 6}, "nothing is left of 12x16 pixels"),
         ({"min_opacity": 1}, "--min-opacity: no Gaussian is left of 384"),
     ],
 )
 def test_what_cannot_be_asked_for(values: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        clean(one_a_pixel(wall(), poses(0, 0.5)), wall(), poses(0, 0.5), INTRINSICS, Cleaning(**values))
+        filter_gaussians(one_a_pixel(wall(), poses(0, 0.5)), wall(), poses(0, 0.5), INTRINSICS, FilterOptions(**values))
 
 
 # ---- what it is worth
@@ -240,7 +251,7 @@ class Room:
     def psnr(self, gaussians: Gaussians) -> float:
         """Of the view between, drawn from the splats of the other two."""
         camera: Camera = self.between
-        drawn = draw_view(gaussians, camera.extrinsics, camera.K, camera.width, camera.height)
+        drawn = render_view(gaussians, camera.extrinsics, camera.K, camera.width, camera.height)
         return float(-10 * np.log10(np.square(np.clip(drawn.rgb, 0, 1) - self.photograph).mean()))
 
 
@@ -251,7 +262,9 @@ def room(scene: Path) -> Room:
 
 def test_merging_spares_gaussians_and_no_quality(room: Room) -> None:
     whole = room.splats(room.depth)
-    left, taken = clean(whole, room.depth, room.extrinsics, room.intrinsics, Cleaning(merge_duplicates=True))
+    left, taken = filter_gaussians(
+        whole, room.depth, room.extrinsics, room.intrinsics, FilterOptions(merge_duplicates=True)
+    )
     assert taken["merge_duplicates"] > 0.3 * len(whole)
     assert room.psnr(left) > room.psnr(whole)
 
@@ -262,8 +275,9 @@ def test_doubt_finds_what_floats_in_the_air(room: Room) -> None:
     floating[0, 30:60, 40:90] = True
     depth[floating] *= 0.6
     spoiled = room.splats(depth)
-    left, taken = clean(spoiled, depth, room.extrinsics, room.intrinsics, Cleaning(min_confidence=0.5))
-    assert taken["min_confidence"] > 0.5 * floating.sum()
+    filters = FilterOptions(min_consistency=0.5)
+    left, taken = filter_gaussians(spoiled, depth, room.extrinsics, room.intrinsics, filters)
+    assert taken["min_consistency"] > 0.5 * floating.sum()
     spoiled_psnr, cleaned_psnr, true_psnr = map(room.psnr, (spoiled, left, room.splats(room.depth)))
     assert true_psnr > spoiled_psnr + 0.5
     assert cleaned_psnr > (spoiled_psnr + true_psnr) / 2  # it wins back more than half of what they spoil

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from idesplat.runtime.geometry.quaternions import from_smallest_three, smallest_three, unit_quaternions
 from idesplat.runtime.rendering.rasterizer import rasterize
-from idesplat.runtime.splats.axes import GLTF, OPENGL, half_turned
+from idesplat.runtime.splats.axes import GLTF, OPENGL, convert_axes
 from idesplat.runtime.splats.formats import codebooks
-from idesplat.runtime.splats.formats.codebooks import codebook, nearest, palette
+from idesplat.runtime.splats.formats.codebooks import build_codebook, cluster_vectors, quantize
 from idesplat.runtime.splats.formats.compressed_ply import CHUNK
 from idesplat.runtime.splats.formats.morton import morton_order
 from idesplat.runtime.splats.gaussians import Gaussians
-from idesplat.runtime.splats.io import read_scene, write_scene
+from idesplat.runtime.splats.io import read_splats, write_splats
 from splat_cases import ARRAYS, load_truth
 
 
@@ -26,7 +26,7 @@ def test_a_half_turn_is_a_rotation_of_the_whole_scene(truth: Gaussians, signs: t
     """Drawn by a camera that turns along, the turned scene is the same picture."""
     turn = np.diag([*signs, 1.0])
     assert np.linalg.det(turn) == 1
-    turned = half_turned(truth, signs)
+    turned = convert_axes(truth, signs)
     K = np.array([[60.0, 0, 40], [0, 60.0, 30], [0, 0, 1]])
     drawn = [
         rasterize(s.means, s.quats, s.scales, s.opacities, s.sh, viewmat, K, 80, 60).rgb
@@ -34,7 +34,7 @@ def test_a_half_turn_is_a_rotation_of_the_whole_scene(truth: Gaussians, signs: t
     ]
     assert drawn[0].max() > 0.5
     np.testing.assert_allclose(drawn[1], drawn[0], atol=2e-5)
-    again = half_turned(turned, signs)
+    again = convert_axes(turned, signs)
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(again, name), getattr(truth, name))
 
@@ -73,8 +73,8 @@ def test_chunks_keep_their_own_precision(tmp_path: Path) -> None:
         np.full(count, 0.5, np.float32),
         np.zeros((count, 1, 3), np.float32),
     )
-    write_scene(tmp_path / "scene.compressed.ply", scene)
-    near = read_scene(tmp_path / "scene.compressed.ply").means
+    write_splats(tmp_path / "scene.compressed.ply", scene)
+    near = read_splats(tmp_path / "scene.compressed.ply").means
     near = near[near[:, 0] < 500]
     distance = np.abs(near[:, None] - means[None, :CHUNK]).max(axis=-1).min(axis=1)
     assert distance.max() <= 0.01 / 2046 + 1e-6
@@ -83,27 +83,27 @@ def test_chunks_keep_their_own_precision(tmp_path: Path) -> None:
 def test_codebooks_reach_everywhere_and_are_dense_where_values_are() -> None:
     rng = np.random.default_rng(0)
     values = np.concatenate([rng.normal(0, 0.01, 20_000), [-5, 5]])
-    book = codebook(values)
+    book = build_codebook(values)
     assert book.shape == (256,) and (np.diff(book) >= 0).all()
-    off = np.abs(book[nearest(values, book)] - values)
+    off = np.abs(book[quantize(values, book)] - values)
     assert off.max() <= 10 / 256
     assert np.median(off) < 1e-3  # evenly spread ones would be off by .01
-    np.testing.assert_array_equal(nearest(values, book), np.abs(book[None] - values[:, None]).argmin(axis=1))
-    np.testing.assert_array_equal(codebook(np.full(7, 3.0)), np.full(256, 3.0))
+    np.testing.assert_array_equal(quantize(values, book), np.abs(book[None] - values[:, None]).argmin(axis=1))
+    np.testing.assert_array_equal(build_codebook(np.full(7, 3.0)), np.full(256, 3.0))
 
 
 def test_palettes_choose_the_nearest_of_learned_vectors(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(0)
     vectors = rng.normal(size=(3000, 6)).astype(np.float32)
-    few, labels = palette(vectors)
+    few, labels = cluster_vectors(vectors)
     np.testing.assert_array_equal(few[labels], vectors)
     monkeypatch.setattr(codebooks, "PALETTE", 64)
-    learned, labels = palette(vectors)
+    learned, labels = cluster_vectors(vectors)
     assert learned.shape == (64, 6)
     distances = np.linalg.norm(vectors[:, None] - learned[None], axis=-1)
     np.testing.assert_allclose(distances[np.arange(3000), labels], distances.min(axis=1), atol=1e-5)
     chosen = [rng.choice(vectors, 64, replace=False) for _ in range(20)]
     by_chance = [np.linalg.norm(vectors[:, None] - some[None], axis=-1).min(axis=1) for some in chosen]
     assert np.square(distances.min(axis=1)).mean() < min(np.square(off).mean() for off in by_chance)
-    again, _ = palette(vectors)
+    again, _ = cluster_vectors(vectors)
     np.testing.assert_array_equal(again, learned)

@@ -19,7 +19,7 @@ from idesplat.runtime.rendering.rasterizer import rasterize
 from idesplat.runtime.splats.axes import GLTF
 from idesplat.runtime.splats.formats.ply import read_ply, write_ply
 from idesplat.runtime.splats.gaussians import Gaussians
-from idesplat.runtime.splats.io import FORMATS, MESHES, POINTS, read_scene, scene_suffix, write_scene
+from idesplat.runtime.splats.io import FORMATS, MESHES, POINTS, read_splats, splat_suffix, write_splats
 from plyfile import PlyData
 from splat_cases import (
     ARRAYS,
@@ -52,8 +52,8 @@ def truth() -> Gaussians:
 @pytest.mark.parametrize("degree", [0, 1, 2])
 def test_what_we_write_comes_back(tmp_path: Path, truth: Gaussians, suffix: str, degree: int) -> None:
     truth = without_bands(truth, degree)
-    notes = write_scene(tmp_path / f"scene{suffix}", truth)
-    back = read_scene(tmp_path / f"scene{suffix}")
+    notes = write_splats(tmp_path / f"scene{suffix}", truth)
+    back = read_splats(tmp_path / f"scene{suffix}")
     assert back.sh_degree == min(degree, highest_degree(suffix))
     assert bool(notes) == (degree > highest_degree(suffix))
     assert_close(back, truth, our_bounds(suffix, truth), in_order=suffix not in SORTED)
@@ -61,11 +61,11 @@ def test_what_we_write_comes_back(tmp_path: Path, truth: Gaussians, suffix: str,
 
 @pytest.mark.parametrize("source", FORMATS)
 def test_each_format_takes_what_each_reader_gives(tmp_path: Path, truth: Gaussians, source: str) -> None:
-    write_scene(tmp_path / f"source{source}", truth)
-    scene = read_scene(tmp_path / f"source{source}")
+    write_splats(tmp_path / f"source{source}", truth)
+    scene = read_splats(tmp_path / f"source{source}")
     for suffix in FORMATS:
-        write_scene(tmp_path / f"scene{suffix}", scene)
-        back = read_scene(tmp_path / f"scene{suffix}")
+        write_splats(tmp_path / f"scene{suffix}", scene)
+        back = read_splats(tmp_path / f"scene{suffix}")
         assert_close(back, without_bands(scene, back.sh_degree), our_bounds(suffix, scene), suffix not in SORTED)
 
 
@@ -74,19 +74,19 @@ def test_the_third_degree_and_no_gaussians(tmp_path: Path, truth: Gaussians, suf
     rng = np.random.default_rng(0)
     sh = np.concatenate([truth.sh, rng.uniform(-0.9, 0.9, (len(truth), 7, 3)).astype(np.float32)], axis=1)
     third = Gaussians(truth.means, truth.scales, truth.quats, truth.opacities, sh)
-    write_scene(tmp_path / f"third{suffix}", third)
-    assert_close(read_scene(tmp_path / f"third{suffix}"), third, our_bounds(suffix, third), suffix not in SORTED)
+    write_splats(tmp_path / f"third{suffix}", third)
+    assert_close(read_splats(tmp_path / f"third{suffix}"), third, our_bounds(suffix, third), suffix not in SORTED)
     none = Gaussians(*(getattr(third, name)[:0] for name in ARRAYS))
     if suffix in NEVER_EMPTY:
         with pytest.raises(InputError, match="there are no Gaussians"):
-            write_scene(tmp_path / f"none{suffix}", none)
+            write_splats(tmp_path / f"none{suffix}", none)
         return
-    write_scene(tmp_path / f"none{suffix}", none)
+    write_splats(tmp_path / f"none{suffix}", none)
     if suffix == ".splat":  # without a header there is nothing that says so
         with pytest.raises(InputError, match="is empty"):
-            read_scene(tmp_path / f"none{suffix}")
+            read_splats(tmp_path / f"none{suffix}")
     else:
-        assert len(read_scene(tmp_path / f"none{suffix}")) == 0
+        assert len(read_splats(tmp_path / f"none{suffix}")) == 0
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
@@ -101,11 +101,11 @@ def test_pictures_look_the_same(tmp_path: Path, suffix: str) -> None:
         opacities=rng.uniform(0.2, 0.9, count).astype(np.float32),
         sh=rng.uniform(-0.4, 0.4, (count, (highest_degree(suffix) + 1) ** 2, 3)).astype(np.float32),
     )
-    write_scene(tmp_path / f"scene{suffix}", scene)
+    write_splats(tmp_path / f"scene{suffix}", scene)
     K = np.array([[80.0, 0, 40], [0, 80.0, 30], [0, 0, 1]])
     drawn = [
         rasterize(s.means, s.quats, s.scales, s.opacities, s.sh, np.eye(4), K, 80, 60).rgb
-        for s in (scene, read_scene(tmp_path / f"scene{suffix}"))
+        for s in (scene, read_splats(tmp_path / f"scene{suffix}"))
     ]
     psnr = -10 * np.log10(np.square(drawn[0] - drawn[1]).mean() + 1e-12)
     # Half steps of 1/510 and less in colour and opacity, and of .032 in a scale: 40 dB is an rms of .01.
@@ -140,7 +140,7 @@ def foreign_bounds(suffix: str, truth: Gaussians) -> Bounds:
 @pytest.mark.parametrize("name", FOREIGN)
 def test_we_read_what_others_wrote(truth: Gaussians, name: str) -> None:
     suffix = FOREIGN[name]
-    back = read_scene(DATA / name)
+    back = read_splats(DATA / name)
     assert back.sh_degree == min(2, highest_degree(suffix))
     if suffix == ".sog":  # 256 sets of spherical harmonics for 270 Gaussians, so that at least 14 share another's
         order = np.linalg.norm(back.means[:, None] - truth.means[None], axis=-1).argmin(axis=1)
@@ -194,7 +194,7 @@ def test_splat_transform_reads_what_we_wrote(
     tmp_path: Path, truth: Gaussians, splat_transform: str, suffix: str
 ) -> None:
     degree = min(2, highest_degree(suffix))
-    write_scene(tmp_path / f"ours{suffix}", truth)
+    write_splats(tmp_path / f"ours{suffix}", truth)
     command = [splat_transform, "-q", "-w", "-g", "cpu", tmp_path / f"ours{suffix}", tmp_path / "theirs.ply"]
     subprocess.run(command, check=True, capture_output=True, timeout=120)
     back = read_with_plyfile(tmp_path / "theirs.ply", degree)
@@ -203,7 +203,7 @@ def test_splat_transform_reads_what_we_wrote(
 
 def test_trimesh_shows_a_glb_as_coloured_points(tmp_path: Path, truth: Gaussians) -> None:
     """As a viewer without splats does, in glTF's axes: x left, y up, z forward."""
-    write_scene(tmp_path / "scene.glb", truth)
+    write_splats(tmp_path / "scene.glb", truth)
     points = trimesh.load(tmp_path / "scene.glb", force="scene").to_geometry()
     np.testing.assert_allclose(points.vertices, truth.means * [-1, -1, 1], rtol=1e-6)
     srgb = np.clip(truth.colours, 0, 1)
@@ -214,7 +214,7 @@ def test_trimesh_shows_a_glb_as_coloured_points(tmp_path: Path, truth: Gaussians
 
 def test_the_official_validator_accepts_a_glb(tmp_path: Path, truth: Gaussians) -> None:
     """Khronos' own, which does not know the extension yet and therefore not the names of its attributes."""
-    write_scene(tmp_path / "scene.glb", truth)
+    write_splats(tmp_path / "scene.glb", truth)
     program = (
         "const path = require('path');"
         "const folder = process.env.PATH.split(path.delimiter).find(p => p.includes('_npx'));"
@@ -232,11 +232,11 @@ def test_the_official_validator_accepts_a_glb(tmp_path: Path, truth: Gaussians) 
 def test_spz_positions_are_as_fine_as_the_extent_allows(tmp_path: Path, truth: Gaussians) -> None:
     for factor in (1e-3, 1, 1e5):
         scene = Gaussians(truth.means * np.float32(factor), *(getattr(truth, name) for name in ARRAYS[1:]))
-        write_scene(tmp_path / "scene.spz", scene)
-        off = np.abs(read_scene(tmp_path / "scene.spz").means - scene.means).max()
+        write_splats(tmp_path / "scene.spz", scene)
+        off = np.abs(read_splats(tmp_path / "scene.spz").means - scene.means).max()
         assert off <= max(1.5 * 2.0**-23 * np.abs(scene.means).max(), 2.0**-25)  # a half of it from float32
     with pytest.raises(InputError, match=r"reaches 8\.97782e\+06 units.*write a \.ply"):
-        write_scene(
+        write_splats(
             tmp_path / "far.spz", Gaussians(truth.means * np.float32(1e6), *(getattr(truth, n) for n in ARRAYS[1:]))
         )
     assert not (tmp_path / "far.spz").exists()
@@ -247,7 +247,7 @@ def test_what_a_format_cannot_hold_is_said(tmp_path: Path, truth: Gaussians) -> 
     scene.sh[3, 2, 1] = 5
     scene.scales[5, 0] = 1e-12
     scene.sh[7, 0] = 2 / SH_0
-    notes = {suffix: " ".join(write_scene(tmp_path / f"scene{suffix}", scene)) for suffix in FORMATS}
+    notes = {suffix: " ".join(write_splats(tmp_path / f"scene{suffix}", scene)) for suffix in FORMATS}
     assert notes[".ply"] == ""
     assert "above degree 0 left out" in notes[".splat"] and "3 of 810 colours outside 0 to 1" in notes[".splat"]
     for text in ("1 of 810 scales outside 4.54e-05", "1 of 2,430 spherical harmonics", "3 of 810 colours"):
@@ -259,16 +259,16 @@ def test_what_a_format_cannot_hold_is_said(tmp_path: Path, truth: Gaussians) -> 
 
 
 def test_the_longest_ending_counts() -> None:
-    assert scene_suffix(Path("a/b.COMPRESSED.PLY")) == ".compressed.ply"
-    assert scene_suffix(Path("a/b.c.ply")) == ".ply"
+    assert splat_suffix(Path("a/b.COMPRESSED.PLY")) == ".compressed.ply"
+    assert splat_suffix(Path("a/b.c.ply")) == ".ply"
     with pytest.raises(InputError, match=r"scene\.txt: expected a file name that ends in \.ply, "):
-        scene_suffix(Path("scene.txt"))
+        splat_suffix(Path("scene.txt"))
 
 
 @pytest.mark.parametrize("suffix", POINTS)
 def test_points_of_a_scene(tmp_path: Path, truth: Gaussians, suffix: str) -> None:
     path = tmp_path / f"scene{suffix}"
-    assert write_scene(path, truth) == [
+    assert write_splats(path, truth) == [
         "points alone, without size, opacity or anything that changes with the direction"
     ]
     positions = (
@@ -277,18 +277,18 @@ def test_points_of_a_scene(tmp_path: Path, truth: Gaussians, suffix: str) -> Non
     signs = GLTF if suffix.endswith(".glb") else (1, 1, 1)
     np.testing.assert_allclose(positions, truth.means * signs, rtol=1e-6, atol=1e-8)
     with pytest.raises(InputError, match="points and surfaces hold no Gaussians"):
-        read_scene(path)
+        read_splats(path)
 
 
 def test_a_surface_is_not_made_of_gaussians(tmp_path: Path, truth: Gaussians) -> None:
     for suffix in MESHES:
         with pytest.raises(InputError, match="write it with idesplat-infer"):
-            write_scene(tmp_path / f"scene{suffix}", truth)
+            write_splats(tmp_path / f"scene{suffix}", truth)
 
 
 def test_a_compressed_ply_under_another_name(tmp_path: Path, truth: Gaussians) -> None:
     shutil.copy(DATA / "scene.compressed.ply", tmp_path / "scene.ply")
-    assert len(read_scene(tmp_path / "scene.ply")) == len(truth)
+    assert len(read_splats(tmp_path / "scene.ply")) == len(truth)
 
 
 def test_the_command_goes_all_the_way_round(
@@ -316,7 +316,7 @@ def test_the_command_leaves_out_what_is_faint(
     kept = truth.opacities >= 0.3
     assert run_command(convert, "a.ply", "b.glb", "--min-opacity", "0.3") == 0
     assert f"cleaned: {(~kept).sum()} too faint; {kept.sum()} Gaussians left" in capsys.readouterr().out
-    np.testing.assert_array_equal(read_scene(Path("b.glb")).means, truth.means[kept])
+    np.testing.assert_array_equal(read_splats(Path("b.glb")).means, truth.means[kept])
     for value, message in (("1", "--min-opacity 1: no Gaussian is left of 270"), ("nan", "--min-opacity nan")):
         assert run_command(convert, "a.ply", "c.glb", "--min-opacity", value) == 2
         assert message in capsys.readouterr().err
@@ -389,7 +389,7 @@ def test_glb_with_integers_and_strides(tmp_path: Path, truth: Gaussians) -> None
     header = b"glTF" + bytes(8) + text + length + b"BIN\0"
     path = tmp_path / "scene.glb"
     path.write_bytes(glb(header + binary, lambda d: d.update(document)))
-    back = read_scene(path)
+    back = read_splats(path)
     np.testing.assert_array_equal(back.means, row["position"] * [-1, -1, 1])
     np.testing.assert_allclose(back.scales, np.tile([1, 0.2, 0], (3, 1)), atol=1e-6)
     np.testing.assert_allclose(back.opacities, [0, 0.2, 1], atol=1e-6)
@@ -410,7 +410,7 @@ def test_spz_of_version_2(tmp_path: Path, truth: Gaussians) -> None:
     ]
     path = tmp_path / "scene.spz"
     path.write_bytes(gzipped(b"".join(parts)))
-    back = read_scene(path)
+    back = read_splats(path)
     bounds = our_bounds(".spz", truth)._replace(means=(2.0**-13,) * 3, quats=2)
     assert_close(back, without_bands(truth, 0), bounds)
     # w is what x, y and z leave, so that only they are kept to half a step.

@@ -16,7 +16,7 @@ from idesplat.runtime.cli.render import main as render_main
 from idesplat.runtime.cli.view import _relative
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.splats.gaussians import with_colours
-from idesplat.runtime.splats.io import FORMATS, read_offset, read_scene, write_scene
+from idesplat.runtime.splats.io import FORMATS, read_offset, read_splats, write_splats
 from idesplat.runtime.viewer.viser_scene import Viewpoint
 from idesplat.runtime.views.world_offset import parse_offset
 from tiny_model import write_model
@@ -86,7 +86,7 @@ def test_an_offset_keeps_the_scene_and_is_recorded(workplace: Path, given: str) 
     assert infer("far.json", "far.ply", *arguments, "--render", "views") == 0
     offset = read_offset(Path("far.ply"))
     assert np.abs(offset - PLACE).max() <= (0 if given == OFFSET else 1)
-    expected, found = read_scene(Path("near.ply")), read_scene(Path("far.ply"))
+    expected, found = read_splats(Path("near.ply")), read_splats(Path("far.ply"))
     close = np.abs(found.means + (offset - PLACE) - expected.means).max(axis=1) < 1e-4
     assert close.mean() > 0.999
     assert json.loads(Path("far.json.out").read_text())["offset"] == offset.tolist()
@@ -130,21 +130,21 @@ def some_gaussians():
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_formats_record_offsets_or_say_that_they_do_not(tmp_path: Path, suffix: str) -> None:
     path, plain = tmp_path / f"scene{suffix}", tmp_path / f"plain{suffix}"
-    notes = write_scene(path, some_gaussians(), PLACE)
-    assert write_scene(plain, some_gaussians()) == [note for note in notes if "relative" not in note]
+    notes = write_splats(path, some_gaussians(), PLACE)
+    assert write_splats(plain, some_gaussians()) == [note for note in notes if "relative" not in note]
     assert not read_offset(plain).any()
     if suffix in RECORDING:
         np.testing.assert_array_equal(read_offset(path), PLACE)
     else:
         assert suffix in OTHERS
         assert "relative to 433125.25, 5411987.5, 312.125" in notes[-1]
-    found, expected = read_scene(path), read_scene(plain)
+    found, expected = read_splats(path), read_splats(plain)
     np.testing.assert_array_equal(found.means, expected.means)
 
 
 def test_conversion_keeps_the_offset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "scene.ply"
-    write_scene(path, some_gaussians(), PLACE)
+    write_splats(path, some_gaussians(), PLACE)
     for suffix in RECORDING[1:]:
         converted = path.with_name(f"converted{suffix}")
         assert run_command(convert_main, path, converted) == 0
@@ -156,7 +156,7 @@ def test_conversion_keeps_the_offset(tmp_path: Path, capsys: pytest.CaptureFixtu
 @pytest.mark.parametrize("line", ("nan 0 0", "a b c", "1e999 0 0"))
 def test_a_damaged_record_is_refused(tmp_path: Path, line: str) -> None:
     path = tmp_path / "scene.ply"
-    write_scene(path, some_gaussians(), PLACE)
+    write_splats(path, some_gaussians(), PLACE)
     path.write_bytes(path.read_bytes().replace(b"433125.25 5411987.5 312.125", line.encode()))
     with pytest.raises(InputError, match="records the offset"):
         read_offset(path)
@@ -164,9 +164,9 @@ def test_a_damaged_record_is_refused(tmp_path: Path, line: str) -> None:
 
 def test_the_viewer_puts_cameras_where_the_scene_is(tmp_path: Path) -> None:
     path = tmp_path / "scene.ply"
-    write_scene(path, some_gaussians(), PLACE)
+    write_splats(path, some_gaussians(), PLACE)
     (found,) = _relative([Viewpoint(cameras_at(PLACE)[0], None)], path)
     np.testing.assert_array_equal(found.camera.extrinsics, np.eye(4))
     camera = replace(cameras_at(PLACE)[0], extrinsics=np.eye(4))
-    write_scene(path, some_gaussians())
+    write_splats(path, some_gaussians())
     assert _relative([Viewpoint(camera, None)], path)[0].camera is camera

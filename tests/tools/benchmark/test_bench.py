@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import SMALL, SMALL_PRESET, run_command
-from idesplat.runtime.inference.session import CPU, Tuning, open_session
+from idesplat.runtime.inference.session import CPU, SessionConfig, open_session
 from idesplat.tools.benchmark import cli as bench
 from idesplat.tools.benchmark.report import Row, compare, read_rows, write_rows
 from idesplat.tools.benchmark.worker import (
@@ -100,7 +100,7 @@ def test_flop_of_operators_worked_by_hand(tmp_path):
     result = helper.make_tensor_value_info("y", TensorProto.INT32, None)
     graph = helper.make_graph(nodes, "graph", [given], [result], weights)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=10)
-    session = open_session(model.SerializeToString(), CPU, Tuning(1, tmp_path / "profile", optimise=False))
+    session = open_session(model.SerializeToString(), CPU, SessionConfig(1, tmp_path / "profile", optimise=False))
     (y,) = session.run(None, {"x": rng.normal(size=(1, 4, 10, 12)).astype(np.float32)})
     kernels = last_kernels(Path(session.end_profiling()))
     counted = {kernel["args"]["op_name"]: flop_of(kernel["args"]) for kernel in kernels}

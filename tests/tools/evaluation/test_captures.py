@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 import pytest
 from conftest import run_command
-from idesplat.runtime import Runner, read_cameras
+from idesplat.runtime import Predictor, read_cameras
 from idesplat.runtime.cameras.camera import Camera
 from idesplat.runtime.errors import InputError
-from idesplat.runtime.inference import predictor as runner
+from idesplat.runtime.inference import predictor as predictor_module
 from idesplat.tools.evaluation import captures, checkouts
 from idesplat.tools.evaluation.captures import CaptureImages, parse_view_counts, read_captures
 from idesplat.tools.evaluation.checkouts import extract, fetch_checkout, find_checkout, list_folder
@@ -192,10 +192,10 @@ def measured(
     exported: tuple[Path, Path],
     monkeypatch: pytest.MonkeyPatch,
     capsys: Capsys,
-) -> tuple[dict[str, Any], Runner]:
-    """The command's results for triples and three views, with the runner that it used."""
-    opened = Runner(exported[0])
-    monkeypatch.setattr(runner, "Runner", lambda path: opened)
+) -> tuple[dict[str, Any], Predictor]:
+    """The command's results for triples and three views, with the predictor that it used."""
+    opened = Predictor(exported[0])
+    monkeypatch.setattr(predictor_module, "Predictor", lambda path: opened)
     monkeypatch.chdir(capture_file.parent)
     checkouts_folder = repository[0].parents[1]
     options = ("--checkouts", checkouts_folder, "--model", exported[0], "--out", "out", "--views", "3, 2,4")
@@ -204,7 +204,7 @@ def measured(
 
 
 def test_the_command_measures_what_the_library_gives(
-    measured: tuple[dict[str, Any], Runner], scene: Path, capsys: Capsys
+    measured: tuple[dict[str, Any], Predictor], scene: Path, capsys: Capsys
 ) -> None:
     content, opened = measured
     (capture,) = read_captures()

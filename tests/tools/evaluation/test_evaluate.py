@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import torch
 from conftest import run_command
-from idesplat.runtime import Gaussians, Runner, rasterize, read_cameras
+from idesplat.runtime import Gaussians, Predictor, rasterize, read_cameras
 from idesplat.runtime.cli.outputs import Outputs
 from idesplat.runtime.images.io import find_images, load_image
 from idesplat.runtime.images.resizing import fit
-from idesplat.runtime.inference import predictor as runner
+from idesplat.runtime.inference import predictor as predictor_module
 from idesplat.runtime.system.files import replacing
 from idesplat.runtime.views.batch import match
 from idesplat.tools.evaluation import cli as evaluate
@@ -29,13 +29,13 @@ from test_chunks import as_scene
 
 
 @pytest.fixture(scope="session")
-def opened(exported: tuple[Path, Path]) -> Runner:
+def opened(exported: tuple[Path, Path]) -> Predictor:
     """The small network; opening it takes longer than running it."""
-    return Runner(exported[0])
+    return Predictor(exported[0])
 
 
 @pytest.fixture
-def workplace(scene: Path, exported: tuple[Path, Path], opened: Runner, tmp_path: Path, monkeypatch: Any) -> Path:
+def workplace(scene: Path, exported: tuple[Path, Path], opened: Predictor, tmp_path: Path, monkeypatch: Any) -> Path:
     """A folder of one's own with photographs, cameras, depth, model, chunks and index, and we stand in it."""
     shutil.copytree(scene, tmp_path, dirs_exist_ok=True)
     shutil.copy(exported[0], tmp_path / "model.onnx")
@@ -44,7 +44,9 @@ def workplace(scene: Path, exported: tuple[Path, Path], opened: Runner, tmp_path
     index = {"x": None, "b": {"context": [0, 4], "target": [1, 2, 3]}, "gone": {"context": [0, 1], "target": [2]}}
     (tmp_path / "index.json").write_text(json.dumps(index))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(runner, "Runner", lambda path: opened if path == Path("model.onnx") else Runner(path))
+    monkeypatch.setattr(
+        predictor_module, "Predictor", lambda path: opened if path == Path("model.onnx") else Predictor(path)
+    )
     return tmp_path
 
 
@@ -65,7 +67,7 @@ def drawn_from(gaussians: Gaussians, pose: np.ndarray, K: np.ndarray, near: floa
     return rasterize(*scene, np.linalg.inv(pose.astype(np.float64)), K, 96, 64, near=near).rgb
 
 
-def test_scene_measures_what_the_library_gives(workplace: Path, opened: Runner, capsys: Capture) -> None:
+def test_scene_measures_what_the_library_gives(workplace: Path, opened: Predictor, capsys: Capture) -> None:
     assert run_command(main, *SCENE, *NAMED, "--near", "1", "--far", "20", "--depth", "depth") == 0
     cameras = read_cameras("transforms.json")
     context = [cameras[0], cameras[4]]
@@ -113,7 +115,7 @@ def test_scene_without_names_says_what_was_chosen(workplace: Path, capsys: Captu
     assert only["context"] == ["001.png", "002.png", "003.png"] and only["depth"] == {}
 
 
-def test_chunks_give_the_papers_means(workplace: Path, opened: Runner, capsys: Capture) -> None:
+def test_chunks_give_the_papers_means(workplace: Path, opened: Predictor, capsys: Capture) -> None:
     assert run_command(main, *CHUNKS) == 0
     content = results()
     (only,) = content["scenes"]
@@ -150,7 +152,7 @@ def test_chunks_go_on_after_a_damaged_scene(workplace: Path, scene: Path, capsys
     assert "skipped blind: frame 1: the picture cannot be decoded" in printed and "skipped still: " in printed
 
 
-def test_procedural_scenes_have_true_depth(workplace: Path, opened: Runner, capsys: Capture) -> None:
+def test_procedural_scenes_have_true_depth(workplace: Path, opened: Predictor, capsys: Capture) -> None:
     assert len(HELD_OUT_SEEDS) == evaluate.HELD_OUT_SCENES
     assert run_command(main, *PROCEDURAL, "--views", "3") == 0
     content = results()
