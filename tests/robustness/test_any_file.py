@@ -141,9 +141,9 @@ JSON = json.JSONDecoder().decode
 def targets(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Target]:
     """A good file of every kind, and its reader."""
     global ENTRY
-    from idesplat.tools.evaluation.chunks import Entry
+    from idesplat.tools.evaluation.chunks import IndexEntry
 
-    ENTRY = Entry([0, 4], [1])
+    ENTRY = IndexEntry([0, 4], [1])
     folder = tmp_path_factory.mktemp("good")
     found = [Target(f"image.{kind}", image_of(kind), read_image) for kind in IMAGES]
 

@@ -1,8 +1,7 @@
 """The command idesplat-bench: how long exported models take, how much memory, and on what.
 
-Whatever is compared runs in turn, round by round, each in a process of its own: where the machine is busier for a
-while, it is so for all of them. Beside them run a large product of matrices, which says what the machine can do, and
-the same networks in eager PyTorch where that is installed.
+Candidates run interleaved, round by round, each in a process of its own, so transient load affects all of them equally.
+Beside them run a large GEMM, whose rate is the roofline, and the same networks in eager PyTorch where it is installed.
 """
 
 import os
@@ -63,7 +62,7 @@ class Entry:
 @guards_outputs("idesplat-bench")
 def bench(
     models: Annotated[
-        list[Path] | None, typer.Argument(help="Models (.onnx or staged folders) instead of the carried one.")
+        list[Path] | None, typer.Argument(help="Models (.onnx or staged folders) instead of the bundled one.")
     ] = None,
     views: Annotated[str, typer.Option(help="Numbers of views, such as 2,4.")] = "2",
     sizes: Annotated[
@@ -160,18 +159,18 @@ def measure(entries: Sequence[Entry], workload: "Workload", settings: Settings, 
     """A row for each network in PyTorch, where that is to be run, and one for each model."""
     rows = [_row(entry, workload) for entry in entries]
     networks = _network_rows(rows, workload, settings)
-    _race(rows, networks, entries, workload, settings, say)
+    _run_interleaved(rows, networks, entries, workload, settings, say)
     for row, entry in zip(rows, entries, strict=True):
         if row.problem is None:
             say(f"{row.name}: where its time goes")
             _add_shares(row, entry, workload, settings)
     for row in (*networks, *rows):
         counted = [other.flop for other in rows if other.preset == row.preset and other.flop]
-        row.floor_flop = min(counted, default=None)
+        row.roofline_flop = min(counted, default=None)
     return [*networks, *rows]
 
 
-def _race(
+def _run_interleaved(
     rows: "Sequence[Row]",
     networks: "Sequence[Row]",
     entries: Sequence[Entry],
@@ -179,26 +178,26 @@ def _race(
     settings: Settings,
     say: Say,
 ) -> None:
-    """Run everything in turn, round by round, and note in the rows what comes of it."""
-    from .worker import Worker, eager, exported, matrix
+    """Run the candidates interleaved, round by round, and record the measurements in the rows."""
+    from .worker import Worker, eager, exported, gemm
 
     prepared: list[tuple] = [(row, eager, row.preset) for row in networks]
     prepared += [(row, exported, entry.model, entry.provider) for row, entry in zip(rows, entries, strict=True)]
     with ExitStack() as stack:
-        machine = stack.enter_context(Worker(matrix))
-        racing: list[tuple[Row, Worker]] = []
-        for row, *contestant in prepared:
+        reference = stack.enter_context(Worker(gemm))
+        running: list[tuple[Row, Worker]] = []
+        for row, *candidate in prepared:
             say(f"{row.name}: opening")
             with _noting_failure(row):
-                worker = stack.enter_context(Worker(*contestant, settings.threads, workload))
-                racing.append((row, worker))
+                worker = stack.enter_context(Worker(*candidate, settings.threads, workload))
+                running.append((row, worker))
         for turn in range(settings.repeats):
-            first = turn % max(len(racing), 1)  # nobody always runs after the same one
-            for row, worker in racing[first:] + racing[:first]:
+            first = turn % max(len(running), 1)  # no candidate always runs after the same one
+            for row, worker in running[first:] + running[:first]:
                 say(f"{row.name}: round {turn + 1} of {settings.repeats}")
-                _run_once(row, worker, machine)
-        _note_depth_errors(racing)
-        for row, worker in racing:
+                _run_once(row, worker, reference)
+        _note_depth_errors(running)
+        for row, worker in running:
             with _noting_failure(row):
                 row.load_seconds = worker.about["load_seconds"]
                 row.peak_bytes = worker.finish() if row.problem is None else None
@@ -207,11 +206,11 @@ def _race(
         row.eager_seconds = seconds.get(row.preset, []) if row.seconds else []
 
 
-def _run_once(row: "Row", worker: "Worker", machine: "Worker") -> None:
-    """One more run, and the machine's FLOP a second just before it; not of a contestant that has failed."""
+def _run_once(row: "Row", worker: "Worker", reference: "Worker") -> None:
+    """Run a candidate once more, after the GEMM reference; skipped where the candidate has failed."""
     if row.problem is None:
         with _noting_failure(row):
-            row.rates.append(machine.run().result)
+            row.gemm_rates.append(reference.run().result)
             time.sleep(SETTLE_SECONDS)
             row.seconds.append(worker.run().seconds)
             time.sleep(SETTLE_SECONDS)
@@ -219,21 +218,21 @@ def _run_once(row: "Row", worker: "Worker", machine: "Worker") -> None:
 
 @contextmanager
 def _noting_failure(row: "Row") -> Iterator[None]:
-    """Let a contestant that fails leave the race, and its row say why."""
+    """Take a candidate that fails out of the benchmark; its row says why."""
     from .worker import Failed
 
     try:
         yield
     except Failed as problem:
-        row.problem, row.seconds, row.rates = str(problem), [], []
+        row.problem, row.seconds, row.gemm_rates = str(problem), [], []
 
 
-def _note_depth_errors(racing: "Sequence[tuple[Row, Worker]]") -> None:
+def _note_depth_errors(running: "Sequence[tuple[Row, Worker]]") -> None:
     """How far each model's depth is from that of the first one of the same checkpoint."""
     import numpy as np
 
     first: dict[str, np.ndarray] = {}
-    for row, worker in racing:
+    for row, worker in running:
         if row.checkpoint:
             depth = worker.about["depth"]
             reference = first.setdefault(row.checkpoint, depth)

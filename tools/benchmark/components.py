@@ -1,4 +1,4 @@
-"""The rasteriser and .ply files, timed in turn with what else does their work: numbers for docs/performance.md.
+"""The rasteriser and .ply files, timed beside other implementations: numbers for docs/performance.md.
 
 python -P -m idesplat.tools.benchmark.components
 
@@ -36,7 +36,7 @@ DRAWN_SPLATS = 2 * SIDE * SIDE
 FILE_SPLATS = 500_000
 PLY_COLUMNS = 41  # of SH degree 2, with normals
 
-Contestants = dict[str, tuple[Any, ...]]
+Candidates = dict[str, tuple[Any, ...]]
 
 
 def main(
@@ -45,23 +45,23 @@ def main(
 ) -> None:
     """Time the rasteriser and .ply files."""
     threads = threads or usable_cores()
-    drawing: Contestants = {"NumPy": (rasterizer, False)}
+    rasterizers: Candidates = {"NumPy": (rasterizer, False)}
     if find_spec("numba"):
-        drawing["compiled (numba)"] = (rasterizer, True)
+        rasterizers["compiled (numba)"] = (rasterizer, True)
     if find_spec("torch") and find_spec("gsplat"):
-        drawing = {"torch, gsplat's reference": (torch_rasterizer, threads), **drawing}
+        rasterizers = {"torch, gsplat's reference": (torch_rasterizer, threads), **rasterizers}
     with thread_environment(threads), tempfile.TemporaryDirectory() as folder:
-        race(f"{DRAWN_SPLATS:,} splats a pixel wide at {SIDE}x{SIDE}", drawing, repeats)
-        race(f"writing {FILE_SPLATS:,} splats, SH degree 2", _files(Path(folder), "write"), repeats)
-        race(f"reading {FILE_SPLATS:,} splats, SH degree 2", _files(Path(folder), "read"), repeats)
+        run_interleaved(f"{DRAWN_SPLATS:,} splats a pixel wide at {SIDE}x{SIDE}", rasterizers, repeats)
+        run_interleaved(f"writing {FILE_SPLATS:,} splats, SH degree 2", _files(Path(folder), "write"), repeats)
+        run_interleaved(f"reading {FILE_SPLATS:,} splats, SH degree 2", _files(Path(folder), "read"), repeats)
 
 
-def race(title: str, contestants: Contestants, repeats: int) -> None:
-    """Run every contestant in turn, round by round; print medians, and ratios to the first one's."""
-    seconds: dict[str, list[float]] = {name: [] for name in contestants}
+def run_interleaved(title: str, candidates: Candidates, repeats: int) -> None:
+    """Run the candidates interleaved, round by round; print medians, and ratios to the first one's."""
+    seconds: dict[str, list[float]] = {name: [] for name in candidates}
     first_seconds = {}
     with ExitStack() as stack, Console(stderr=True).status(title):
-        workers = {name: stack.enter_context(Worker(*contestant)) for name, contestant in contestants.items()}
+        workers = {name: stack.enter_context(Worker(*candidate)) for name, candidate in candidates.items()}
         for name, worker in workers.items():
             first_seconds[name] = worker.run().seconds
         for _ in range(repeats):
@@ -196,7 +196,7 @@ def _composite(centres: "Tensor", conics: "Tensor", opacities: "Tensor", paint: 
 # ---- files
 
 
-def _files(folder: Path, verb: str) -> Contestants:
+def _files(folder: Path, verb: str) -> Candidates:
     """Ours beside the same bytes written or read with NumPy alone."""
     return {"NumPy, the same bytes": (plain_file, folder, verb), "ours": (ply_file, folder, verb)}
 

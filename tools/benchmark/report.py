@@ -15,6 +15,7 @@ from ...runtime.cli.terminal import literal
 from ...runtime.errors import InputError
 from ...runtime.system.files import read_bytes
 
+VERSION = 2  # of the JSON's layout; version 1 had no such field
 WIDTH = 150  # columns, where there is no terminal to ask
 SHOWN = 7  # operators of a row
 # Runs of the same thing may differ by this factor, whatever their spread says.
@@ -34,8 +35,8 @@ class Row:
     width: int
     checkpoint: str = ""  # SHA-256
     seconds: list[float] = field(default_factory=list)
-    # In the same rounds: the machine's FLOP a second, and the seconds of the same network in eager PyTorch.
-    rates: list[float] = field(default_factory=list)
+    # In the same rounds: the GEMM reference's FLOP per second, and the seconds of the same network in eager PyTorch.
+    gemm_rates: list[float] = field(default_factory=list)
     eager_seconds: list[float] = field(default_factory=list)
     load_seconds: float | None = None
     peak_bytes: int | None = None
@@ -43,7 +44,7 @@ class Row:
     depth_error: float | None = None
     # Of this graph, and the fewest of any graph of the same network and workload.
     flop: int | None = None
-    floor_flop: int | None = None
+    roofline_flop: int | None = None
     operators: dict[str, float] = field(default_factory=dict)
     stages: dict[str, float] = field(default_factory=dict)
     # Why there is nothing of the above.
@@ -62,7 +63,7 @@ class Row:
     @property
     def effort(self) -> np.ndarray:
         """FLOP that the machine could have done in each run: a time that does not depend on how fast it is just now."""
-        return np.multiply(self.seconds, self.rates)
+        return np.multiply(self.seconds, self.gemm_rates)
 
     @property
     def to_eager(self) -> float | None:
@@ -70,9 +71,9 @@ class Row:
         return float(np.median(np.divide(self.seconds, self.eager_seconds))) if self.eager_seconds else None
 
     @property
-    def to_floor(self) -> float | None:
-        """Time over that of its FLOP in one large product of matrices, the median over the rounds."""
-        return float(np.median(self.effort) / self.floor_flop) if self.floor_flop and self.seconds else None
+    def to_roofline(self) -> float | None:
+        """Time over the roofline: that of its FLOP at the rate of the GEMM reference, the median over the rounds."""
+        return float(np.median(self.effort) / self.roofline_flop) if self.roofline_flop and self.seconds else None
 
 
 def print_rows(rows: Sequence[Row]) -> None:
@@ -80,7 +81,7 @@ def print_rows(rows: Sequence[Row]) -> None:
     table = Table()
     for name in ("model", "precision", "on", "views", "size"):
         table.add_column(name, no_wrap=True)
-    for name in ("seconds", "spread", "/ eager", "/ floor", "GFLOP", "peak GB", "opened in", "depth off"):
+    for name in ("seconds", "spread", "/ eager", "/ roofline", "GFLOP", "peak GB", "opened in", "depth off"):
         table.add_column(name, justify="right")
     for row in rows:
         names = (literal(row.model), row.precision, row.provider, str(row.views), f"{row.height}x{row.width}")
@@ -99,16 +100,20 @@ def print_rows(rows: Sequence[Row]) -> None:
 
 def write_rows(path: Path, machine: dict[str, Any], rows: Sequence[Row]) -> None:
     """Write everything that was measured as JSON."""
-    write_json(path, json.dumps({"machine": machine, "rows": [asdict(row) for row in rows]}, indent=1))
+    content = {"version": VERSION, "machine": machine, "rows": [asdict(row) for row in rows]}
+    write_json(path, json.dumps(content, indent=1))
 
 
 def read_rows(path: Path) -> list[Row]:
     """The rows of a file that `write_rows` wrote; raises InputError."""
     try:
-        return [Row(**entry) for entry in json.loads(read_bytes(path, "what --json of idesplat-bench wrote"))["rows"]]
+        content = json.loads(read_bytes(path, "what --json of idesplat-bench wrote"))
+        if content.get("version", 1) != VERSION and content["rows"]:
+            raise InputError(f"{path}: is of an older layout of --json; measure it again with this version")
+        return [Row(**entry) for entry in content["rows"]]
     except InputError:
         raise
-    except (ValueError, TypeError, LookupError, RecursionError):
+    except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
         raise InputError(f"{path}: not what --json of this version of idesplat-bench writes") from None
 
 
@@ -156,7 +161,7 @@ def _numbers(row: Row) -> list[str]:
         f"{median:.3g}",
         f"{(high - low) / median:.0%}",
         _number(row.to_eager, "{:.2f}"),
-        _number(row.to_floor, "{:.2f}"),
+        _number(row.to_roofline, "{:.2f}"),
         _number(row.flop and row.flop / 1e9, "{:.0f}"),
         _number(row.peak_bytes and row.peak_bytes / 1e9, "{:.2f}"),
         _number(row.load_seconds, "{:.2f} s"),

@@ -17,16 +17,16 @@ import numpy as np
 
 from ..processes import safe_path
 
-# Of the square matrices whose product says what the machine can do: large enough to be as fast as it gets.
-MATRIX_SIDE = 2048
-MATRIX_FLOP = 2 * MATRIX_SIDE**3
-MATRIX_PRODUCTS = 3
+# Side of the GEMM reference's square matrices, large enough to reach the machine's peak rate.
+GEMM_SIDE = 2048
+GEMM_FLOP = 2 * GEMM_SIDE**3
+GEMM_REPEATS = 3
 TIMES_PROFILED = 2
 NODE_SUFFIX = "_kernel_time"
 # Operators whose time is that of others inside them.
 LOOPS = ("Scan", "Loop", "If")
 # Operators whose FLOP are counted, as a graph has them before it is optimised.
-PRODUCTS = ("MatMul", "MatMulInteger", "Gemm", "Conv", "ConvTranspose")
+MATMULS = ("MatMul", "MatMulInteger", "Gemm", "Conv", "ConvTranspose")
 RUN = "run"
 
 
@@ -40,21 +40,21 @@ class Workload:
 
 
 class Run(NamedTuple):
-    """One run of a contestant: its seconds, and what it gave."""
+    """One run of a candidate: its seconds, and what it gave."""
 
     seconds: float
     result: Any
 
 
 class Failed(Exception):
-    """A contestant cannot compete; the message says why."""
+    """A candidate cannot compete; the message says why."""
 
 
 Prepared = tuple[Any, Callable[[], Any]]
 
 
 class Worker:
-    """A contestant in its process, seen from the process that measures."""
+    """A candidate in its process, seen from the process that measures."""
 
     def __init__(self, prepare: Callable[..., Prepared], *arguments: Any) -> None:
         """Have `prepare` make ready what is to be run, and keep in `about` what it says of it. Raises Failed."""
@@ -98,7 +98,7 @@ class Worker:
 
 
 def _serve(pipe: Connection, prepare: Callable[..., Prepared], arguments: tuple) -> None:
-    """A contestant's process: runs whenever it is told to."""
+    """A candidate's process: runs whenever it is told to."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # who measures decides when to stop
     try:
         about, run = prepare(*arguments)
@@ -128,21 +128,21 @@ def peak_bytes() -> int | None:
     return None
 
 
-# ---- contestants: what they say of themselves, and what is run
+# ---- candidates: what they say of themselves, and what is run
 
 
-def matrix() -> Prepared:
-    """The product of two large matrices, in NumPy; a run gives FLOP a second.
+def gemm() -> Prepared:
+    """The GEMM reference: the product of two large matrices in NumPy; a run gives FLOP per second.
 
     The environment says how many threads NumPy takes: it has no other way.
     """
-    left, right = np.random.default_rng(0).random((2, MATRIX_SIDE, MATRIX_SIDE), np.float32)
+    left, right = np.random.default_rng(0).random((2, GEMM_SIDE, GEMM_SIDE), np.float32)
 
     def run() -> float:
         started = time.perf_counter()
-        for _ in range(MATRIX_PRODUCTS):
+        for _ in range(GEMM_REPEATS):
             np.matmul(left, right)
-        return MATRIX_PRODUCTS * MATRIX_FLOP / (time.perf_counter() - started)
+        return GEMM_REPEATS * GEMM_FLOP / (time.perf_counter() - started)
 
     run()
     return None, run
@@ -216,7 +216,7 @@ def analyse(model: Path, provider: str, threads: int, workload: Workload) -> Pre
 
 
 def example_arrays(workload: Workload, near: float, far: float) -> tuple[np.ndarray, ...]:
-    """Pictures of coarse noise and cameras on a line, as a model's inputs in their order."""
+    """Images of coarse noise and cameras on a line, as a model's inputs in their order."""
     views, height, width = workload.views, workload.height, workload.width
     rng = np.random.default_rng(0)
     coarse = rng.random((views, 3, height // 8 + 1, width // 8 + 1), np.float32)
@@ -252,7 +252,7 @@ def last_kernels(profile: Path) -> list[dict[str, Any]]:
 def flop_of(args: dict[str, Any]) -> int:
     """Floating-point operations of one operator, from the shapes in ONNX Runtime's notes."""
     operator = args["op_name"]
-    if operator not in PRODUCTS:
+    if operator not in MATMULS:
         return 0
     first, second = (next(iter(entry.values())) for entry in args["input_type_shape"][:2])
     result = next(iter(args["output_type_shape"][0].values()))

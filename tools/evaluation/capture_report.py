@@ -12,7 +12,7 @@ from ...runtime.cli.terminal import say
 from ...runtime.system.files import replacing
 from .capture_scores import PAIRS, CaptureScores, mean_of_captures
 from .captures import PAIR
-from .novel_views import MODEL, NEAREST, PLANE, Scores
+from .novel_views import MODEL, NEAREST, ORACLE_PLANE, Scores
 from .report import RESULTS, print_table
 
 # Heading, method and measure of a column of means.
@@ -22,8 +22,8 @@ COLUMNS = (
     ("SSIM", MODEL, "ssim"),
     ("LPIPS", MODEL, "lpips"),
     ("nearest", NEAREST, "psnr"),
-    ("plane", PLANE, "psnr"),
-    ("plane,\nfitted", PLANE, "psnr_fitted"),
+    ("oracle\nplane", ORACLE_PLANE, "psnr"),
+    ("oracle plane,\nfitted", ORACLE_PLANE, "psnr_fitted"),
     ("from the\ntwo around", PAIRS, "psnr"),
     ("input\nviews", MODEL, "input_psnr"),
 )

@@ -9,11 +9,11 @@ import numpy as np
 
 from ...runtime.inference.predictor import Predictor
 from ...runtime.splats.gaussians import Gaussians
-from .baselines import best_plane, nearest_view
+from .baselines import best_fronto_parallel_plane, nearest_view
 from .captures import PAIR, Capture, CaptureImages
-from .cases import Case
+from .cases import EvalCase
 from .metrics import LPIPS, fit_exposure, psnr, ssim
-from .novel_views import MODEL, NEAREST, PLANE, Scores, comparison_strip, draw
+from .novel_views import MODEL, NEAREST, ORACLE_PLANE, Scores, comparison_strip, render_target
 
 PAIRS = "pairs"  # the model's result from the two views around each held-out frame
 
@@ -98,14 +98,18 @@ class CaptureEvaluator:
             result.cases[count] = [self._window(case, pairs, show)]
         return result
 
-    def _triple(self, case: Case, show: Show | None) -> CaseScores:
+    def _triple(self, case: EvalCase, show: Show | None) -> CaseScores:
         """A pair of views and one held-out frame, beside what other methods make of it."""
         gaussians, seconds = self._predict(case)
         pose, K = case.targets.extrinsics[0], case.targets.K(0)
-        truth, valid = case.targets.picture(0), case.targets.valid[0]
-        plane, _ = best_plane(case.context, truth, valid, pose, K, case.near, case.far)
-        rendering = draw(gaussians, case.targets, 0)
-        images = {MODEL: rendering.rgb, NEAREST: case.context.picture(nearest_view(case.context, pose)), PLANE: plane}
+        truth, valid = case.targets.image(0), case.targets.valid[0]
+        plane, _ = best_fronto_parallel_plane(case.context, truth, valid, pose, K, case.near, case.far)
+        rendering = render_target(gaussians, case.targets, 0)
+        images = {
+            MODEL: rendering.rgb,
+            NEAREST: case.context.image(nearest_view(case.context, pose)),
+            ORACLE_PLANE: plane,
+        }
         scores = {method: self._measure(image, truth, valid) for method, image in images.items()}
         if show is not None:
             show(_strip_name(case, 0), comparison_strip(truth, valid, rendering, plane))
@@ -113,21 +117,21 @@ class CaptureEvaluator:
             case.context.names, [TargetScores(case.targets.names[0], scores)], _input_psnr(gaussians, case), seconds
         )
 
-    def _window(self, case: Case, pairs: dict[str, Scores], show: Show | None) -> CaseScores:
+    def _window(self, case: EvalCase, pairs: dict[str, Scores], show: Show | None) -> CaseScores:
         """Several views and the held-out frames between them; pairs: the scores of each frame from its neighbours."""
         gaussians, seconds = self._predict(case)
         targets = []
         for index, name in enumerate(case.targets.names):
-            truth, valid = case.targets.picture(index), case.targets.valid[index]
-            rendering = draw(gaussians, case.targets, index)
+            truth, valid = case.targets.image(index), case.targets.valid[index]
+            rendering = render_target(gaussians, case.targets, index)
             scores = {MODEL: self._measure(rendering.rgb, truth, valid), PAIRS: pairs[name][MODEL]}
-            scores |= {method: pairs[name][method] for method in (NEAREST, PLANE)}
+            scores |= {method: pairs[name][method] for method in (NEAREST, ORACLE_PLANE)}
             targets.append(TargetScores(name, scores))
             if show is not None:
                 show(_strip_name(case, index), comparison_strip(truth, valid, rendering, None))
         return CaseScores(case.context.names, targets, _input_psnr(gaussians, case), seconds)
 
-    def _predict(self, case: Case) -> tuple[Gaussians, float]:
+    def _predict(self, case: EvalCase) -> tuple[Gaussians, float]:
         context, started = case.context, time.perf_counter()
         prediction = self.predictor.predict_arrays(
             context.images, context.extrinsics, context.intrinsics, case.near, case.far
@@ -154,15 +158,15 @@ def mean_of_captures(results: Sequence[CaptureScores], count: int) -> Scores:
     }
 
 
-def _input_psnr(gaussians: Gaussians, case: Case) -> float:
+def _input_psnr(gaussians: Gaussians, case: EvalCase) -> float:
     """The mean PSNR of the context frames rendered from all Gaussians."""
     context = case.context
     values = [
-        psnr(draw(gaussians, context, view).rgb, context.picture(view), context.valid[view])
+        psnr(render_target(gaussians, context, view).rgb, context.image(view), context.valid[view])
         for view in range(len(context))
     ]
     return float(np.mean(values))
 
 
-def _strip_name(case: Case, target: int) -> str:
+def _strip_name(case: EvalCase, target: int) -> str:
     return f"{case.name}-{Path(case.targets.names[target]).stem}"

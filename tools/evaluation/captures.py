@@ -33,7 +33,7 @@ from ...runtime.images.io import load_image
 from ...runtime.system.limits import whole_number
 from ...runtime.views.batch import Views, take
 from ...runtime.views.depth_range import DepthRange
-from .cases import Case, Posed
+from .cases import EvalCase, PosedImages
 from .image_folders import valid_pixels
 
 CAPTURES_FILE = Path(__file__).with_name("captures.json")
@@ -113,7 +113,7 @@ class CaptureImages:
         """Image files with their cameras, at the images' own size."""
         return [(self.folder / name, self.capture.cameras[name]) for name in names]
 
-    def case(self, context: Sequence[str], targets: Sequence[str], find_range: FindRange) -> Case:
+    def case(self, context: Sequence[str], targets: Sequence[str], find_range: FindRange) -> EvalCase:
         """Context and held-out frames as arrays, with near and far from the context views.
 
         Raises InputError for images that cannot be read or have another size than their cameras.
@@ -121,7 +121,7 @@ class CaptureImages:
         views = self._views(context)
         found = find_range(views)
         name = f"{self.capture.name}-{len(context)}-{Path(context[0]).stem}"
-        return Case(name, self._posed(context), self._posed(targets), found.near, found.far)
+        return EvalCase(name, self._posed(context), self._posed(targets), found.near, found.far)
 
     def _views(self, names: Sequence[str]) -> Views:
         frames = [self._load(name) for name in names]
@@ -133,10 +133,10 @@ class CaptureImages:
             [frame.camera for frame in frames],
         )
 
-    def _posed(self, names: Sequence[str]) -> Posed:
+    def _posed(self, names: Sequence[str]) -> PosedImages:
         views = self._views(names)
         valid = np.stack([self._load(name).valid for name in names])
-        return Posed(views.names, views.images, views.extrinsics, views.intrinsics, valid)
+        return PosedImages(views.names, views.images, views.extrinsics, views.intrinsics, valid)
 
     def _load(self, name: str) -> LoadedFrame:
         if name not in self._loaded:

@@ -12,14 +12,14 @@ SAME_SURFACE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class Posed:
-    """Pictures with their cameras at the network's size.
+class PosedImages:
+    """Images with their cameras at the network's size.
 
-    names: of the pictures, [views].
+    names: of the images, [views].
     images: float32 RGB in [0, 1], [views, 3, height, width].
     extrinsics: camera-to-world, OpenCV axes, [views, 4, 4].
     intrinsics: row 0 divided by the width, row 1 by the height, [views, 3, 3].
-    valid: bool, [views, height, width]; False where the camera saw nothing and the picture was filled.
+    valid: bool, [views, height, width]; False where the camera saw nothing and the image was filled.
     """
 
     names: list[str]
@@ -31,8 +31,8 @@ class Posed:
     def __len__(self) -> int:
         return len(self.names)
 
-    def picture(self, view: int) -> np.ndarray:
-        """One picture, [height, width, 3]."""
+    def image(self, view: int) -> np.ndarray:
+        """One image, [height, width, 3]."""
         return self.images[view].transpose(1, 2, 0)
 
     def K(self, view: int) -> np.ndarray:
@@ -42,51 +42,51 @@ class Posed:
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
+class EvalCase:
     """Context views for a network, and target views of the same scene that it does not see.
 
     near, far: the depth range, in scene units. depth: true z-depth of the context views in scene units,
     [views, height, width], not positive where unknown; None where there is none.
-    seen: whether some context view sees what a pixel of a target shows, bool [targets, height, width]; None where that
-    is not known.
+    covisible: whether some context view sees the surface that a target's pixel shows, bool [targets, height, width];
+    None where that is not known.
     """
 
     name: str
-    context: Posed
-    targets: Posed
+    context: PosedImages
+    targets: PosedImages
     near: float
     far: float
     depth: np.ndarray | None = None
-    seen: np.ndarray | None = None
+    covisible: np.ndarray | None = None
 
 
 def procedural_case(
-    seed: int, context: int, drawn: int, targets: int, height: int, width: int, closer: int = 1
-) -> Case:
+    seed: int, context: int, pool: int, targets: int, height: int, width: int, closer: int = 1
+) -> EvalCase:
     """The procedural scene of `seed`, with exact depth; the same arguments give the same case.
 
-    Of `drawn` context views along a path, `context` are given to the network: the first, the last, and evenly between.
-    closer: how many times as large targets are drawn as the context; they are windows of such pictures then.
+    pool: context views rendered along a path, of which `context` are given to the network, evenly spaced.
+    closer: how many times as large targets are rendered as the context; they are windows of such images then.
     """
     from ..synthetic.sampler import draw_sample
 
-    sample = draw_sample(seed, drawn, targets, height, width, closer=(closer,) * targets)
-    given = np.linspace(0, drawn - 1, context).round().astype(int)
+    sample = draw_sample(seed, pool, targets, height, width, closer=(closer,) * targets)
+    given = np.linspace(0, pool - 1, context).round().astype(int)
 
-    def posed(kind: str, views: np.ndarray | slice) -> Posed:
+    def posed(kind: str, views: np.ndarray | slice) -> PosedImages:
         images = sample.images[views]
         names = [f"{kind}{index}" for index in range(len(images))]
         valid = np.ones((len(images), height, width), bool)
-        return Posed(names, images, sample.extrinsics[views], sample.intrinsics[views], valid)
+        return PosedImages(names, images, sample.extrinsics[views], sample.intrinsics[views], valid)
 
-    chosen, met = posed("context", given), posed("target", slice(drawn, None))
+    chosen, met = posed("context", given), posed("target", slice(pool, None))
     depth = sample.depth[given]
-    seen = seen_by(unproject(sample.depth[drawn:], met.extrinsics, met.intrinsics), depth, chosen)
-    return Case(str(seed), chosen, met, sample.near, sample.far, depth, seen)
+    covisible = find_covisible(unproject(sample.depth[pool:], met.extrinsics, met.intrinsics), depth, chosen)
+    return EvalCase(str(seed), chosen, met, sample.near, sample.far, depth, covisible)
 
 
-def seen_by(points: np.ndarray, depth: np.ndarray, views: Posed) -> np.ndarray:
-    """Whether points [..., 3] are seen by some view, from the views' true z-depth [views, height, width]."""
+def find_covisible(points: np.ndarray, depth: np.ndarray, views: PosedImages) -> np.ndarray:
+    """Whether some view sees points [..., 3], from the views' true z-depth [views, height, width]."""
     seen = np.zeros(points.shape[:-1], bool)
     for surface, extrinsics, intrinsics in zip(depth, views.extrinsics, views.intrinsics, strict=True):
         pixel, z, inside = seen_from(points, surface.shape, extrinsics, intrinsics)

@@ -26,24 +26,24 @@ from ...runtime.geometry.intrinsics import check_intrinsics
 from ...runtime.geometry.rigid import invert_rigid
 from ...runtime.images.resizing import cover, fit
 from ...runtime.system.files import check_regular, read_bytes
-from .cases import Case, Posed
+from .cases import EvalCase, PosedImages
 
 CAMERA_NUMBERS = 18
 FIRST_POSE_NUMBER = 6
 # Of the near plane: the releases' renderer draws no Gaussian that is nearer to the camera.
-NEAREST_DRAWN = 0.2
+NEAR_PLANE_FACTOR = 0.2
 INSTALL = "pip install 'idesplat[eval]'"
 
 
 @dataclass(frozen=True)
-class Entry:
+class IndexEntry:
     """What the evaluation index asks of a scene: numbers of frames."""
 
     context: list[int]
     target: list[int]
 
 
-def read_index(path: Path) -> dict[str, Entry]:
+def read_index(path: Path) -> dict[str, IndexEntry]:
     """The scenes of a published evaluation index that are not left out; raises InputError if it is none, or empty."""
     try:
         content = json.loads(read_bytes(path, "an evaluation index"))
@@ -102,15 +102,15 @@ def read_chunk(path: Path) -> list[dict[str, Any]]:
 
 def chunk_cases(
     chunks: list[Path],
-    index: dict[str, Entry],
+    index: dict[str, IndexEntry],
     size: tuple[int, int],
     depth_range: tuple[float, float],
     skip: Callable[[str, str], None],
-) -> Iterator[Case]:
+) -> Iterator[EvalCase]:
     """The indexed scenes of the chunks, in their order, prepared as the papers do; `skip` hears a scene and why.
 
     size: height and width. depth_range: near and far, the same for all scenes.
-    Scenes with a damaged picture or an impossible pose are skipped, as the releases do. Raises InputError as
+    Scenes with a damaged image or an impossible pose are skipped, as the releases do. Raises InputError as
     `read_chunk` does, and for frames that a scene has not.
     """
     for path in chunks:
@@ -129,12 +129,12 @@ def chunk_cases(
             except InputError as error:
                 skip(scene["key"], str(error))
                 continue
-            yield Case(scene["key"], context, targets, *depth_range)
+            yield EvalCase(scene["key"], context, targets, *depth_range)
 
 
-def _entry(value: object, where: str) -> Entry:
+def _entry(value: object, where: str) -> IndexEntry:
     if isinstance(value, dict) and _are_frames(value.get("context")) and _are_frames(value.get("target")):
-        return Entry(value["context"], value["target"])
+        return IndexEntry(value["context"], value["target"])
     raise InputError(f'{where}: expected null, or {{"context": [...], "target": [...]}} with numbers of frames')
 
 
@@ -160,7 +160,7 @@ def _check_scene(scene: dict[str, Any], where: str) -> None:
             raise InputError(f"{where} ({key}): images[{number}] is no uint8 tensor [bytes] of a JPEG file")
 
 
-def _posed(scene: dict[str, Any], frames: list[int], height: int, width: int) -> Posed:
+def _posed(scene: dict[str, Any], frames: list[int], height: int, width: int) -> PosedImages:
     images, intrinsics, extrinsics = [], [], []
     for frame in frames:
         with located(f"frame {frame}"):
@@ -171,7 +171,7 @@ def _posed(scene: dict[str, Any], frames: list[int], height: int, width: int) ->
         extrinsics.append(pose)
     names = [str(frame) for frame in frames]
     valid = np.ones((len(frames), height, width), bool)
-    return Posed(names, np.stack(images), np.stack(extrinsics), np.stack(intrinsics), valid)
+    return PosedImages(names, np.stack(images), np.stack(extrinsics), np.stack(intrinsics), valid)
 
 
 def _camera(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -184,21 +184,21 @@ def _camera(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _decoded(content: np.ndarray) -> np.ndarray:
-    """The picture in the bytes of a JPEG file, RGB [height, width, 3] in uint8."""
+    """The image in the bytes of a JPEG file, RGB [height, width, 3] in uint8."""
     from PIL import Image
 
     try:
-        with Image.open(io.BytesIO(content.tobytes())) as picture:
-            return np.asarray(picture.convert("RGB"))
+        with Image.open(io.BytesIO(content.tobytes())) as image:
+            return np.asarray(image.convert("RGB"))
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise InputError(f"the picture cannot be decoded ({error})") from None
+        raise InputError(f"the image cannot be decoded ({error})") from None
 
 
 def _fitted(image: np.ndarray, K: np.ndarray, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """The picture covering height x width, float32 [3, height, width], and its normalised intrinsics [3, 3].
+    """The image covering height x width, float32 [3, height, width], and its normalised intrinsics [3, 3].
 
-    The papers scale with Pillow's Lanczos filter, which is sharper than what `fit` does for photographs. On three views
-    of real photographs that alone cost a warped plane 0.3 to 0.6 dB.
+    The papers scale with Pillow's Lanczos filter, which is sharper than what `fit` does for images. On three views
+    of real images that alone cost a warped plane 0.3 to 0.6 dB.
     """
     from PIL import Image
 

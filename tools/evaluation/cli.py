@@ -1,4 +1,4 @@
-"""The command idesplat-eval: how well an exported model draws views that it was not given, in the field's measures."""
+"""The command idesplat-eval: metrics of an exported model on held-out views."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
@@ -23,20 +23,20 @@ if TYPE_CHECKING:  # nothing heavy is loaded before there is something to evalua
 
     from ...runtime.cameras.camera import Camera
     from ...runtime.inference.predictor import Predictor
-    from .cases import Case
+    from .cases import EvalCase
     from .novel_views import Evaluator, Result
 
-# Scenes of which `chunks` and `procedural` leave pictures.
-PICTURED = 8
+# Scenes of which `chunks` and `procedural` leave images.
+SCENES_WITH_IMAGES = 8
 # Of a procedural scene.
 TARGETS = 2
 DEFAULT_VIEWS = 2
 HELD_OUT_SCENES = 200
 
 Skip = Callable[[str, str], None]
-Out = Annotated[Path, typer.Option(help="Folder for results.json and pictures.", show_default=False)]
+Out = Annotated[Path, typer.Option(help="Folder for results.json and images.", show_default=False)]
 Model = Annotated[
-    Path | None, typer.Option(help="A .onnx or staged folder of idesplat-export instead of the carried model.")
+    Path | None, typer.Option(help="A .onnx or staged folder of idesplat-export instead of the bundled model.")
 ]
 Size = Annotated[str | None, typer.Option(help="HEIGHTxWIDTH to work at instead of the trained size.")]
 Near = Annotated[float | None, typer.Option(help="Nearest depth in scene units.")]
@@ -49,14 +49,14 @@ app = typer.Typer(add_completion=False, no_args_is_help=True, help=__doc__)
 @exit_on_input_error
 @guards_outputs("idesplat-eval")
 def scene(
-    images: Annotated[Path, typer.Argument(help="Folder of photographs.", show_default=False)],
+    images: Annotated[Path, typer.Argument(help="Folder of images.", show_default=False)],
     cameras: Annotated[Path, typer.Option(help="Their cameras, such as a transforms.json.", show_default=False)],
     out: Out,
     model: Model = None,
-    context: Annotated[list[str] | None, typer.Option(help="A photograph to infer from; give two or more.")] = None,
-    target: Annotated[list[str] | None, typer.Option(help="A photograph to hold out; give one or more.")] = None,
+    context: Annotated[list[str] | None, typer.Option(help="A image to infer from; give two or more.")] = None,
+    target: Annotated[list[str] | None, typer.Option(help="A image to hold out; give one or more.")] = None,
     views: Annotated[
-        int | None, typer.Option(help="Photographs around each target, without --context; 2 by default.", min=2)
+        int | None, typer.Option(help="Images around each target, without --context; 2 by default.", min=2)
     ] = None,
     hold_out_every: Annotated[int, typer.Option(help="Hold out frames 0, N, 2 N and on, without --target.", min=2)] = 8,
     depth: Annotated[Path | None, typer.Option(help="Folder of true depth, as make_scene writes it.")] = None,
@@ -65,7 +65,7 @@ def scene(
     far: Far = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Hold photographs out, infer from others, and compare; beside the nearest photograph and the best plane."""
+    """Hold images out, infer from others, and compare; beside the nearest image and the oracle plane."""
     if views is not None and context:
         raise InputError("--views and --context: expected one of them; --context names the views that there are")
     from ...runtime.cameras.io import read_cameras
@@ -87,7 +87,7 @@ def scene(
         say(f"held out {_names(frames, held_out)}, inferred from {_names(frames, sources)}")
     find_range = partial(predictor.depth_range, near=near, far=far)
     cases = (load_case(frames, *numbers, shape, find_range, depth) for numbers in chosen)
-    results = _evaluate(cases, len(chosen), Evaluator(predictor, load_lpips()), out, pictured=len(chosen))
+    results = _evaluate(cases, len(chosen), Evaluator(predictor, load_lpips()), out, with_images=len(chosen))
     means = mean_of_views(results)
     print_views(results)
     print_means(means, f"{sum(len(result.targets) for result in results)} views held out, {_by(shape)}")
@@ -107,7 +107,7 @@ def chunks(
     overwrite: Overwrite = False,
 ) -> None:
     """Evaluate on RealEstate10K, ACID or DL3DV as the papers do: pixelSplat's chunks, a published index of frames."""
-    from .chunks import NEAREST_DRAWN, chunk_cases, find_chunks, read_index
+    from .chunks import NEAR_PLANE_FACTOR, chunk_cases, find_chunks, read_index
     from .metrics import load_lpips
     from .novel_views import Evaluator, mean_of_scenes
     from .report import print_means
@@ -123,10 +123,10 @@ def chunks(
         raise InputError(
             f"near {near:g} and far {far:g}: expected 0 < near < far; give --near and --far in scene units"
         )
-    evaluator = Evaluator(predictor, load_lpips(), compare=False, nearest_drawn=NEAREST_DRAWN * near)
+    evaluator = Evaluator(predictor, load_lpips(), compare=False, near_plane=NEAR_PLANE_FACTOR * near)
     skipped: dict[str, str] = {}
     cases = chunk_cases(files, entries, shape, (near, far), skipped.__setitem__)
-    results = _evaluate(cases, len(entries), evaluator, out, PICTURED, skipped.__setitem__)
+    results = _evaluate(cases, len(entries), evaluator, out, SCENES_WITH_IMAGES, skipped.__setitem__)
     for key, reason in skipped.items():
         say(f"skipped {key}: {reason}")
     missing = len(entries) - len(results) - len(skipped)
@@ -153,17 +153,17 @@ def procedural(
         int, typer.Option(help="How many of the held-out scenes.", min=1, max=HELD_OUT_SCENES)
     ] = HELD_OUT_SCENES,
     views: Annotated[int, typer.Option(help="Context views of each scene.", min=2, max=8)] = 2,
-    drawn: Annotated[
+    pool_views: Annotated[
         int | None,
-        typer.Option(help="Context views there are, of which --views are given; to compare."),
+        typer.Option(help="Render this many context views and give --views of them, to compare numbers of views."),
     ] = None,
     size: Size = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Evaluate on the held-out procedural scenes: depth against the truth, and novel views (extra `eval`)."""
+    """Evaluate on the held-out synthetic scenes: depth against the truth, and novel views (extra `eval`)."""
     if find_spec("numba") is None:
         raise InputError(
-            "numba is needed to draw procedural scenes, and is not installed; pip install 'idesplat[eval]'"
+            "numba is needed to render synthetic scenes, and is not installed; pip install 'idesplat[eval]'"
         )
     from ..synthetic.sampler import HELD_OUT_SEEDS
     from .cases import procedural_case
@@ -174,14 +174,14 @@ def procedural(
     predictor = _runner(model, out, [])
     shape = parse_size(size) if size else (predictor.metadata.height, predictor.metadata.width)
     predictor.check_size(views, *shape)
-    drawn = views if drawn is None else drawn
-    if drawn < views:
-        raise InputError(f"--drawn {drawn}: expected at least the {views} of --views")
-    cases = (procedural_case(seed, views, drawn, TARGETS, *shape) for seed in HELD_OUT_SEEDS[:scenes])
-    results = _evaluate(cases, scenes, Evaluator(predictor, load_lpips()), out, PICTURED)
+    pool = views if pool_views is None else pool_views
+    if pool < views:
+        raise InputError(f"--pool-views {pool}: expected at least the {views} of --views")
+    cases = (procedural_case(seed, views, pool, TARGETS, *shape) for seed in HELD_OUT_SEEDS[:scenes])
+    results = _evaluate(cases, scenes, Evaluator(predictor, load_lpips()), out, SCENES_WITH_IMAGES)
     means = mean_of_scenes(results)
-    print_means(means, f"{scenes} held-out procedural scenes, {views} of {drawn} views, {_by(shape)}")
-    _write(out, {"command": "procedural", "views": views, "drawn": drawn, "size": shape}, predictor, means, results)
+    print_means(means, f"{scenes} held-out synthetic scenes, {views} of {pool} views, {_by(shape)}")
+    _write(out, {"command": "procedural", "views": views, "pool_views": pool, "size": shape}, predictor, means, results)
 
 
 @app.command()
@@ -223,7 +223,7 @@ def captures(
     about = {"command": "captures", "size": shape, "views": counts}
     path = write_capture_results(out, about | _about(predictor), results, counts)
     say(f"wrote {path}")
-    say(f"strips (truth, render, error, depth, and for triples the best plane) are beside it in {out}")
+    say(f"strips (truth, render, error, depth, and for triples the oracle plane) are beside it in {out}")
 
 
 def main() -> None:
@@ -242,7 +242,7 @@ def _by(shape: tuple[int, int]) -> str:
 def _runner(model: Path | None, out: Path, data: Sequence[Path]) -> "Predictor":
     """The model, once it is known that results can be written, and will replace nothing of the data or the user.
 
-    Pictures are named after scenes, which may not be known yet, so any that is there counts as one to be replaced.
+    Images are named after scenes, which may not be known yet, so any that is there counts as one to be replaced.
     """
     from ...runtime.inference.predictor import Predictor
     from .report import RESULTS
@@ -257,9 +257,14 @@ def _runner(model: Path | None, out: Path, data: Sequence[Path]) -> "Predictor":
 
 
 def _evaluate(
-    cases: "Iterable[Case]", total: int, evaluator: "Evaluator", out: Path, pictured: int, skip: Skip | None = None
+    cases: "Iterable[EvalCase]",
+    total: int,
+    evaluator: "Evaluator",
+    out: Path,
+    with_images: int,
+    skip: Skip | None = None,
 ) -> "list[Result]":
-    """Evaluate cases, with a bar on stderr where that is a terminal, and write pictures of the first `pictured` ones.
+    """Evaluate cases, with a bar on stderr where that is a terminal, and write images of the first `with_images` ones.
 
     skip: hears of a case that the model cannot take, and why; without it that is an error.
     """
@@ -269,7 +274,7 @@ def _evaluate(
     for case in progress(cases, "evaluating", total):
         strips: dict[str, np.ndarray] = {}
         try:
-            results.append(evaluator.evaluate(case, strips.__setitem__ if len(results) < pictured else None))
+            results.append(evaluator.evaluate(case, strips.__setitem__ if len(results) < with_images else None))
         except InputError as error:
             if skip is None:
                 raise
@@ -301,4 +306,4 @@ def _write(
 
     path = write_results(out, about | _about(predictor), means, results)
     say(f"wrote {path}")
-    say(f"pictures (truth, render, error, depth, and the best plane where there is one) are beside it in {out}")
+    say(f"images (truth, render, error, depth, and the oracle plane where there is one) are beside it in {out}")

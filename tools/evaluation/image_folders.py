@@ -1,4 +1,4 @@
-"""Cases from a folder of photographs: some are held out, and for each of those a context is chosen among the rest."""
+"""Cases from a folder of images: some are held out, and for each of those a context is chosen among the rest."""
 
 import math
 from collections import defaultdict
@@ -17,19 +17,19 @@ from ...runtime.images.resizing import cover
 from ...runtime.system.files import check_regular
 from ...runtime.views.batch import Views, prepare
 from ...runtime.views.depth_range import DepthRange
-from .cases import Case, Posed
+from .cases import EvalCase, PosedImages
 
 Frame = tuple[Path, Camera]
 
 # A camera that looks this much elsewhere counts as standing twice as far away.
 TURN_DEG = 30.0
-# Photographs that somebody undistorted have black borders, which JPEG makes nearly black, in blocks of 8 pixels.
+# Images that somebody undistorted have black borders, which JPEG makes nearly black, in blocks of 8 pixels.
 BLACK, JPEG_BLOCK = 8, 8
 # Pixels at the network's size that are left out beside what the camera did not see.
 MARGIN = 2
 DEPTH = "depth"  # in an .npz of true depth
 NPY_HEADER_BYTES, MOST_BYTES_A_DEPTH = 1 << 16, 16
-LEAST_VALID = 0.1  # of a picture's pixels
+LEAST_VALID = 0.1  # of a image's pixels
 
 
 def chosen_frames(
@@ -57,7 +57,7 @@ def chosen_frames(
     rest = [number for number in range(len(frames)) if number not in wanted]
     if len(rest) < views:
         raise InputError(
-            f"{len(frames)} photographs, of which {len(wanted)} are held out: too few are left for a context of {views}"
+            f"{len(frames)} images, of which {len(wanted)} are held out: too few are left for a context of {views}"
         )
     poses = np.stack([camera.extrinsics for _, camera in frames])
     together: dict[tuple[int, ...], list[int]] = defaultdict(list)
@@ -88,35 +88,35 @@ def load_case(
     size: tuple[int, int],
     find_range: Callable[[Views], DepthRange],
     depth: Path | None = None,
-) -> Case:
+) -> EvalCase:
     """The frames undistorted, resized and cropped as the network takes them, and which of their pixels are valid.
 
     size: height and width. find_range: finds near and far from the context views.
     depth: a folder of the context's true z-depth, one .npz for each frame, named like it, with `depth` [height, width]
-    at the photograph's size.
-    Raises InputError for pictures, cameras and depth that cannot be used.
+    at the image's size.
+    Raises InputError for images, cameras and depth that cannot be used.
     """
     chosen = [frames[number] for number in (*context, *targets)]
     views = prepare(chosen, None, *size)
     valid = np.stack([valid_pixels(load_image(path), camera, *size) for path, camera in chosen])
     for name, seen in zip(views.names, valid, strict=True):
         if seen.mean() < LEAST_VALID:
-            raise InputError(f"{name}: is black nearly everywhere, or its distortion wrong; expected a photograph")
+            raise InputError(f"{name}: is black nearly everywhere, or its distortion wrong; expected a image")
 
     def taken(part: slice) -> Views:
         images, extrinsics, intrinsics = (field[part] for field in (views.images, views.extrinsics, views.intrinsics))
         samples = views.samples[part]
         return Views(views.names[part], images, extrinsics, intrinsics, views.cameras[part], samples=samples)
 
-    def posed(part: Views, valid: np.ndarray) -> Posed:
-        return Posed(part.names, part.images, part.extrinsics, part.intrinsics, valid)
+    def posed(part: Views, valid: np.ndarray) -> PosedImages:
+        return PosedImages(part.names, part.images, part.extrinsics, part.intrinsics, valid)
 
     count = len(context)
     given, held_out = taken(slice(count)), taken(slice(count, None))
     found = find_range(given)
     truth = None if depth is None else np.stack([_fitted_depth(depth, *frame, *size) for frame in chosen[:count]])
     name = "+".join(path.stem for path, _ in chosen[:count])
-    return Case(name, posed(given, valid[:count]), posed(held_out, valid[count:]), found.near, found.far, truth)
+    return EvalCase(name, posed(given, valid[:count]), posed(held_out, valid[count:]), found.near, found.far, truth)
 
 
 def _number(frames: Sequence[Frame], name: str, option: str) -> int:
@@ -126,7 +126,7 @@ def _number(frames: Sequence[Frame], name: str, option: str) -> int:
         return found[0]
     examples = ", ".join(path.name for path, _ in frames[:3])
     count = "several" if found else "none"
-    raise InputError(f"{option} {name}: the name of {count} of {len(frames)} photographs; they are {examples}, ...")
+    raise InputError(f"{option} {name}: the name of {count} of {len(frames)} images; they are {examples}, ...")
 
 
 def valid_pixels(image: np.ndarray, camera: Camera, height: int, width: int) -> np.ndarray:
@@ -143,7 +143,7 @@ def valid_pixels(image: np.ndarray, camera: Camera, height: int, width: int) -> 
 
 
 def _black_border(image: np.ndarray) -> np.ndarray:
-    """The black regions of a picture [height, width, 3] that reach its border, bool [height, width]."""
+    """The black regions of a image [height, width, 3] that reach its border, bool [height, width]."""
     dark = (image.max(axis=2) <= BLACK).astype(np.uint8)
     _, labels = cv2.connectedComponents(dark, connectivity=4)
     edges = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
@@ -154,7 +154,7 @@ def _black_border(image: np.ndarray) -> np.ndarray:
 def _fitted_depth(folder: Path, path: Path, camera: Camera, height: int, width: int) -> np.ndarray:
     file = folder / f"{path.stem}.npz"
     if camera.distortion is not None:
-        raise InputError(f"{path}: has lens distortion; true depth can only be compared for undistorted photographs")
+        raise InputError(f"{path}: has lens distortion; true depth can only be compared for undistorted images")
     shape = image_size(path)[::-1]
     try:
         check_regular(file)

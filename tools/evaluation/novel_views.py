@@ -1,4 +1,4 @@
-"""One case through an exported model: its target views drawn, and measured beside what other methods make of them."""
+"""One case through an exported model: its target views rendered and measured beside what other methods make of them."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,18 +13,18 @@ from ...runtime.inference.predictor import Predictor
 from ...runtime.rendering.rasterizer import rasterize
 from ...runtime.rendering.types import Rendering
 from ...runtime.splats.gaussians import Gaussians
-from .baselines import best_plane, nearest_view, splats_at
-from .cases import Case, Posed
+from .baselines import best_fronto_parallel_plane, nearest_view, oracle_depth_splats
+from .cases import EvalCase, PosedImages
 from .metrics import LPIPS, depth_measures, psnr, ssim
 
-MODEL, NEAREST, PLANE, TRUE_DEPTH = "model", "nearest", "plane", "true depth"
-# World units from the camera at which Gaussians begin to be drawn, where nothing else is asked for.
-NEAREST_DRAWN = 0.01
+MODEL, NEAREST, ORACLE_PLANE, ORACLE_DEPTH = "model", "nearest", "oracle_plane", "oracle_depth"
+# Default near plane of target renderings, in scene units.
+NEAR_PLANE = 0.01
 # A mean difference of the colours from here on has the brightest colour.
 WORST_ERROR = 0.3
 # Where less of the light is stopped, there is no depth to show.
 LEAST_ALPHA = 0.05
-GAP = 4  # white pixels between the pictures of a strip
+GAP = 4  # white pixels between the images of a strip
 
 # Values by method and measure.
 Scores = dict[str, dict[str, float]]
@@ -59,16 +59,16 @@ class Evaluator:
     """A model and how it is measured.
 
     lpips: the measure, where it is there. compare: whether other methods are measured, too.
-    nearest_drawn: scene units from the camera at which Gaussians begin to be drawn.
+    near_plane: of target renderings, in scene units.
     """
 
     predictor: Predictor
     lpips: LPIPS | None
     compare: bool = True
-    nearest_drawn: float = NEAREST_DRAWN
+    near_plane: float = NEAR_PLANE
 
-    def evaluate(self, case: Case, show: Callable[[str, np.ndarray], None] | None = None) -> Result:
-        """Predict from the context, draw the targets and measure them.
+    def evaluate(self, case: EvalCase, show: Callable[[str, np.ndarray], None] | None = None) -> Result:
+        """Predict from the context, render the targets and measure them.
 
         show: is given each target's name and strip: truth, render, error, depth and, if measured, the plane; RGB in
         [0, 1], [height, all widths, 3]. Raises InputError for what the model cannot take.
@@ -79,43 +79,45 @@ class Evaluator:
         )
         exact = None
         if self.compare and case.depth is not None and (case.depth > 0).all():
-            exact = splats_at(case.depth, given)
+            exact = oracle_depth_splats(case.depth, given)
         targets = []
         for view, name in enumerate(case.targets.names):
-            truth, valid = case.targets.picture(view), case.targets.valid[view]
-            drawn = draw(prediction.need_gaussians(), case.targets, view, self.nearest_drawn)
-            pictures: dict[str, np.ndarray] = {MODEL: drawn.rgb}
+            truth, valid = case.targets.image(view), case.targets.valid[view]
+            rendering = render_target(prediction.need_gaussians(), case.targets, view, self.near_plane)
+            images: dict[str, np.ndarray] = {MODEL: rendering.rgb}
             details: dict[str, Any] = {}
             if self.compare:
                 others, details = self._others(case, view, exact)
-                pictures |= others
-            seen = None if case.seen is None else case.seen[view] & valid
-            scores = {method: self._measure(picture, truth, valid, seen) for method, picture in pictures.items()}
+                images |= others
+            covisible = None if case.covisible is None else case.covisible[view] & valid
+            scores = {method: self._measure(image, truth, valid, covisible) for method, image in images.items()}
             targets.append(Target(name, scores, details))
             if show is not None:
-                show(name, comparison_strip(truth, valid, drawn, pictures.get(PLANE)))
+                show(name, comparison_strip(truth, valid, rendering, images.get(ORACLE_PLANE)))
         depth = {} if case.depth is None else depth_measures(prediction.depth, case.depth)
         return Result(case.name, given.names, case.near, case.far, targets, depth)
 
-    def _others(self, case: Case, view: int, exact: Gaussians | None) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Other methods' pictures of a target, [height, width, 3], and what they found; exact: splats at true depth."""
+    def _others(
+        self, case: EvalCase, view: int, exact: Gaussians | None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Other methods' images of a target, [height, width, 3], and what they found; exact: splats at true depth."""
         context, targets, pose = case.context, case.targets, case.targets.extrinsics[view]
         copied = nearest_view(context, pose)
-        truth, valid = targets.picture(view), targets.valid[view]
-        plane, depth = best_plane(context, truth, valid, pose, targets.K(view), case.near, case.far)
-        pictures = {NEAREST: context.picture(copied), PLANE: plane}
+        truth, valid = targets.image(view), targets.valid[view]
+        plane, depth = best_fronto_parallel_plane(context, truth, valid, pose, targets.K(view), case.near, case.far)
+        images = {NEAREST: context.image(copied), ORACLE_PLANE: plane}
         if exact is not None:
-            pictures[TRUE_DEPTH] = draw(exact, targets, view, self.nearest_drawn).rgb
-        return pictures, {"nearest_view": context.names[copied], "plane_depth": depth}
+            images[ORACLE_DEPTH] = render_target(exact, targets, view, self.near_plane).rgb
+        return images, {"nearest_view": context.names[copied], "oracle_plane_depth": depth}
 
     def _measure(
-        self, picture: np.ndarray, truth: np.ndarray, valid: np.ndarray, seen: np.ndarray | None
+        self, image: np.ndarray, truth: np.ndarray, valid: np.ndarray, covisible: np.ndarray | None
     ) -> dict[str, float]:
-        scores = {"psnr": psnr(picture, truth, valid), "ssim": ssim(picture, truth, valid)}
-        if seen is not None:
-            scores["psnr_seen"] = psnr(picture, truth, seen)
+        scores = {"psnr": psnr(image, truth, valid), "ssim": ssim(image, truth, valid)}
+        if covisible is not None:
+            scores["psnr_covisible"] = psnr(image, truth, covisible)
         if self.lpips is not None:
-            scores["lpips"] = self.lpips(picture, truth, valid)
+            scores["lpips"] = self.lpips(image, truth, valid)
         return scores
 
 
@@ -131,8 +133,8 @@ def mean_of_scenes(results: Sequence[Result]) -> Scores:
     return _mean([mean_of_views([result]) for result in results])
 
 
-def draw(gaussians: Gaussians, targets: Posed, view: int, nearest_drawn: float = NEAREST_DRAWN) -> Rendering:
-    """The Gaussians from a target camera at its picture's size, on black."""
+def render_target(gaussians: Gaussians, targets: PosedImages, view: int, near_plane: float = NEAR_PLANE) -> Rendering:
+    """The Gaussians from a target camera at its image's size, on black."""
     height, width = targets.images.shape[2:]
     return rasterize(
         gaussians.means,
@@ -144,7 +146,7 @@ def draw(gaussians: Gaussians, targets: Posed, view: int, nearest_drawn: float =
         targets.K(view),
         width,
         height,
-        near=nearest_drawn,
+        near=near_plane,
     )
 
 
@@ -156,13 +158,15 @@ def _mean(entries: list[Scores]) -> Scores:
     }
 
 
-def comparison_strip(truth: np.ndarray, valid: np.ndarray, drawn: Rendering, plane: np.ndarray | None) -> np.ndarray:
+def comparison_strip(
+    truth: np.ndarray, valid: np.ndarray, rendering: Rendering, plane: np.ndarray | None
+) -> np.ndarray:
     """Truth, render, error (black where nothing is measured), depth and plane side by side."""
-    error = np.abs(drawn.rgb.clip(0, 1) - truth).mean(axis=2) * valid / WORST_ERROR
+    error = np.abs(rendering.rgb.clip(0, 1) - truth).mean(axis=2) * valid / WORST_ERROR
     hot = cv2.applyColorMap(np.rint(255 * error.clip(0, 1)).astype(np.uint8), cv2.COLORMAP_INFERNO)
-    depth = np.where(drawn.alpha > LEAST_ALPHA, drawn.depth / np.maximum(drawn.alpha, LEAST_ALPHA), 0)
-    pictures = [truth, drawn.rgb, hot[..., ::-1].astype(np.float32) / 255, depth_colours(depth)]
+    depth = np.where(rendering.alpha > LEAST_ALPHA, rendering.depth / np.maximum(rendering.alpha, LEAST_ALPHA), 0)
+    images = [truth, rendering.rgb, hot[..., ::-1].astype(np.float32) / 255, depth_colours(depth)]
     if plane is not None:
-        pictures.append(plane)
+        images.append(plane)
     white = np.ones((len(truth), GAP, 3), np.float32)
-    return np.concatenate([part for picture in pictures for part in (white, picture)][1:], axis=1)
+    return np.concatenate([part for image in images for part in (white, image)][1:], axis=1)

@@ -11,20 +11,22 @@ from rich.table import Table
 
 from ...runtime.cli.terminal import literal, say
 from ...runtime.system.files import replacing
-from .novel_views import MODEL, Result, Scores
+from .novel_views import MODEL, NEAREST, ORACLE_DEPTH, ORACLE_PLANE, Result, Scores
 
 RESULTS = "results.json"
 TITLES = {
     "psnr": "PSNR, dB",
-    "psnr_seen": "PSNR where seen, dB",
+    "psnr_covisible": "PSNR co-visible, dB",
     "ssim": "SSIM",
     "lpips": "LPIPS",
     "abs_rel": "AbsRel",
-    "within_5_percent": "within 5 %",
+    "delta_1.25": "delta < 1.25",
+    "inlier_ratio_1.05": "inlier ratio at 1.05",
 }
-DECIMALS = {"psnr": 2, "psnr_seen": 2}
+DECIMALS = {"psnr": 2, "psnr_covisible": 2}
 USUAL_DECIMALS = 3
-WIDTH = 110  # columns, where there is no terminal to ask
+METHODS = {MODEL: "model", NEAREST: "nearest", ORACLE_PLANE: "oracle plane", ORACLE_DEPTH: "oracle depth"}
+WIDTH = 120  # columns, where there is no terminal to ask
 
 
 def print_views(results: Sequence[Result]) -> None:
@@ -36,7 +38,7 @@ def print_views(results: Sequence[Result]) -> None:
     table.add_column("from")
     for measure, method in columns:
         heading = TITLES[measure] if method == MODEL else ""
-        table.add_column(f"{heading}\n{method}", justify="right", no_wrap=True)
+        table.add_column(f"{heading}\n{METHODS[method]}", justify="right", no_wrap=True)
     for result in results:
         for target in result.targets:
             cells = [_number(measure, target.scores[method][measure]) for measure, method in columns]
@@ -49,10 +51,10 @@ def print_means(means: Scores, title: str) -> None:
     table = Table()
     table.add_column("mean")
     for method in means:
-        table.add_column(method, justify="right")
+        table.add_column(METHODS[method], justify="right")
     compared = [method for method in means if method != MODEL]
     for method in compared:
-        table.add_column(f"over {method}", justify="right")
+        table.add_column(f"over {METHODS[method]}", justify="right")
     for measure, value in means[MODEL].items():
         others = [means[method].get(measure) for method in compared]
         cells = ["" if other is None else _number(measure, other) for other in others]

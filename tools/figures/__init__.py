@@ -1,1 +1,1 @@
-"""What the documents show: tables and pictures."""
+"""What the documents show: tables and images."""

@@ -22,14 +22,14 @@ from ...runtime.inference.session import open_session, run_session
 from ..evaluation.cases import procedural_case
 from ..synthetic.sampler import HELD_OUT_SEEDS
 
-PRODUCTS = ("MatMul", "Conv", "ConvTranspose")
+MATMULS = ("MatMul", "Conv", "ConvTranspose")
 VIEWS = 2
 
 
 @exit_on_input_error
 def main(
-    model: Annotated[Path | None, typer.Argument(help="A .onnx file instead of the carried model.")] = None,
-    scenes: Annotated[int, typer.Option(help="Held-out drawn scenes to measure on.", min=1)] = 3,
+    model: Annotated[Path | None, typer.Argument(help="A .onnx file instead of the bundled model.")] = None,
+    scenes: Annotated[int, typer.Option(help="Held-out synthetic scenes to measure on.", min=1)] = 3,
 ) -> None:
     """Round the operands of one part after the other, and compare depth with that of the model as it is."""
     path = model or bundled_model()
@@ -47,8 +47,8 @@ def main(
     ]
     graph = onnx.load(path)
     exact = _depths(graph, feeds)
-    table = Table("part", "all its products", "those with weights", title="median relative change of depth, largest")
-    parts = dict.fromkeys(node.name.split("/")[1] for node in graph.graph.node if node.op_type in PRODUCTS)
+    table = Table("part", "all matmuls", "matmuls with weights", title="median relative change of depth, largest")
+    parts = dict.fromkeys(node.name.split("/")[1] for node in graph.graph.node if node.op_type in MATMULS)
     with Console(stderr=True).status("rounding") as status:
         for part in parts:
             status.update(f"rounding {part}")
@@ -65,7 +65,7 @@ def _rounded(graph: onnx.ModelProto, part: str, weighted: bool) -> onnx.ModelPro
     nodes: list[onnx.NodeProto] = []
     rounded: set[str] = set()
     for node in copy.graph.node:
-        inside = node.op_type in PRODUCTS and node.name.startswith(f"/{part}/")
+        inside = node.op_type in MATMULS and node.name.startswith(f"/{part}/")
         if inside and (not weighted or node.input[1] in weights):
             for index, name in enumerate(node.input[:2]):
                 if name not in rounded:

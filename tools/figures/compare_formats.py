@@ -1,4 +1,4 @@
-"""What each splat format costs and keeps: bytes, seconds, and the picture drawn from what comes back.
+"""What each splat format costs and keeps: bytes, seconds, and the image drawn from what comes back.
 
 python -P -m idesplat.tools.figures.compare_formats --gaussians 131072
 """
@@ -19,7 +19,7 @@ from ...runtime.splats.io import FORMATS, read_splats, write_splats
 from ..evaluation.metrics import psnr
 
 VIEWS = 2
-SIDE = 256  # of the picture
+SIDE = 256  # of the image
 SH_SPREAD = (0.025, 0.006)  # standard deviations of degree 1 and 2: what networks predict changes little with direction
 
 
@@ -49,7 +49,7 @@ def made_up_scene(gaussians: int) -> Gaussians:
 
 @exit_on_input_error
 def compare(gaussians: Annotated[int, typer.Option(help="How many.", min=100)] = 131_072) -> None:
-    """Print processor seconds to write and to read, megabytes, and PSNR of the picture for each format."""
+    """Print processor seconds to write and to read, megabytes, and PSNR of the image for each format."""
     scene = made_up_scene(gaussians)
     drawn = _draw(scene)
     say(f"{len(scene):,} Gaussians", f"{'format':16}{'write, s':>10}{'read, s':>10}{'MB':>8}{'PSNR, dB':>10}")

@@ -1,4 +1,4 @@
-"""The README's picture: what the carried model makes of two photographs of the drawn room.
+"""The README's image: what the bundled model makes of two images of the drawn room.
 
 python -P -m idesplat.tools.figures.readme_picture demo/scene docs/picture.png
 """
@@ -18,16 +18,16 @@ from ...runtime.inference.predictor import Predictor
 from ...runtime.rendering.render import render_view
 from ...runtime.views.batch import prepare
 
-# Two photographs, and one between them that the model is not given.
+# Two images, and one between them that the model is not given.
 CONTEXT, BETWEEN = (1, 3), 2
 
 
 @exit_on_input_error
-def picture(
+def image(
     scene: Annotated[Path, typer.Argument(help="Folder that make_scene wrote.", show_default=False)],
     out: Annotated[Path, typer.Argument(help="The .png to write.", show_default=False)],
 ) -> None:
-    """Draw photograph, its depth, the view between from splats, the photograph there, and the other photograph."""
+    """Draw image, its depth, the view between from splats, the image there, and the other image."""
     cameras = read_cameras(scene / "transforms.json")
     predictor = Predictor(bundled_model())
     height, width = predictor.size_for(cameras)
@@ -44,7 +44,7 @@ def picture(
 
 def main() -> None:
     """Run the command."""
-    run(picture)
+    run(image)
 
 
 if __name__ == "__main__":

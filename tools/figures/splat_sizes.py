@@ -1,8 +1,8 @@
-"""How large a pixel's splat should be: PSNR by size, of views as large as the photographs and closer.
+"""How large a pixel's splat should be: PSNR by size, of views as large as the images and closer.
 
     python -P -m idesplat.tools.figures.splat_sizes --scenes 24
 
-Small splats hide little of their neighbours and are best at the photographs' own size; seen closer they leave gaps.
+Small splats hide little of their neighbours and are best at the images' own size; seen closer they leave gaps.
 """
 
 from dataclasses import replace
@@ -20,10 +20,10 @@ from ...runtime.errors import exit_on_input_error
 from ...runtime.inference.bundled_model import bundled_model
 from ...runtime.inference.predictor import Predictor
 from ...runtime.splats.gaussians import Gaussians
-from ..evaluation.baselines import SPLAT_PIXELS, splats_at
-from ..evaluation.cases import Case, procedural_case
+from ..evaluation.baselines import SPLAT_PIXELS, oracle_depth_splats
+from ..evaluation.cases import EvalCase, procedural_case
 from ..evaluation.metrics import psnr
-from ..evaluation.novel_views import draw
+from ..evaluation.novel_views import render_target
 from ..synthetic.sampler import HELD_OUT_SEEDS
 
 CLOSER = (1, 2, 4)
@@ -34,14 +34,12 @@ OWN = "model"
 
 @exit_on_input_error
 def main(
-    model: Annotated[Path | None, typer.Argument(help="A .onnx file instead of the carried model.")] = None,
-    scenes: Annotated[int, typer.Option(help="Held-out drawn scenes.", min=1)] = 24,
+    model: Annotated[Path | None, typer.Argument(help="A .onnx file instead of the bundled model.")] = None,
+    scenes: Annotated[int, typer.Option(help="Held-out synthetic scenes.", min=1)] = 24,
 ) -> None:
     """Draw held-out scenes from splats of several sizes at the true depth, and from the model's own, where seen."""
     predictor = Predictor(model or bundled_model())
-    table = Table(
-        "times as large", *(f"{size:g} pixels" for size in SIZES), OWN, title="PSNR, dB, where some input sees"
-    )
+    table = Table("times as large", *(f"{size:g} pixels" for size in SIZES), OWN, title="PSNR, dB, co-visible pixels")
     console = Console(stderr=True)
     for closer in CLOSER:
         seeds = track(HELD_OUT_SEEDS[:scenes], f"{closer} times as large", console=console, transient=True)
@@ -57,14 +55,14 @@ def _measured(predictor: Predictor, seed: int, closer: int) -> list[list[float]]
     given = case.context
     predicted = predictor.predict_arrays(given.images, given.extrinsics, given.intrinsics, case.near, case.far)
     assert case.depth is not None
-    rule = splats_at(case.depth, given)
+    rule = oracle_depth_splats(case.depth, given)
     scenes = [replace(rule, scales=rule.scales * np.float32(size / SPLAT_PIXELS)) for size in SIZES]
     return [[_psnr(scene, case, view) for scene in (*scenes, predicted.need_gaussians())] for view in range(TARGETS)]
 
 
-def _psnr(gaussians: Gaussians, case: Case, view: int) -> float:
-    assert case.seen is not None
-    return psnr(draw(gaussians, case.targets, view).rgb, case.targets.picture(view), case.seen[view])
+def _psnr(gaussians: Gaussians, case: EvalCase, view: int) -> float:
+    assert case.covisible is not None
+    return psnr(render_target(gaussians, case.targets, view).rgb, case.targets.image(view), case.covisible[view])
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from idesplat.export.graph.gather_loops import FEW, chunked
 from idesplat.export.graph.subgraph import names_read
 from idesplat.model.common import gather_attention as gathered
 from idesplat.model.common.gather_attention import GatherAttention
-from idesplat.tools.benchmark.matmuls import INPUTS, Both, exported
+from idesplat.tools.benchmark.gather_attention import INPUTS, Both, exported
 from idesplat.tools.training import gather_attention as compiled
 
 PAIRS, CANDIDATES, PIXELS, CHANNELS = 4, 11, 30, 6

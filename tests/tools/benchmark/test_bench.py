@@ -20,8 +20,8 @@ from idesplat.tools.benchmark.worker import (
     eager,
     example_arrays,
     flop_of,
+    gemm,
     last_kernels,
-    matrix,
 )
 from onnx import TensorProto, helper, numpy_helper
 
@@ -47,22 +47,22 @@ def test_every_model_gets_a_row(measured):
     for row in rows:
         assert (row.preset, row.precision, row.provider) == (SMALL_PRESET, "float32", "CPU")
         assert (row.views, row.height, row.width) == (2, 64, 96)
-        assert len(row.seconds) == len(row.rates) == 2
-        assert row.to_floor > 0
+        assert len(row.seconds) == len(row.gemm_rates) == 2
+        assert row.to_roofline > 0
         assert 50e6 < row.peak_bytes < 4e9
         assert row.load_seconds > 0
         assert sum(row.operators.values()) == pytest.approx(1)
         assert sum(row.stages.values()) == pytest.approx(1)
         assert {"encoder", "dpbu1", "dpbu2", "dpbu3", "gaussians"} <= set(row.stages)
         assert "Conv" in row.operators
-    for text in ("model.onnx", "staged", "/ floor", "Conv", "dpbu3", f"wrote {path}"):
+    for text in ("model.onnx", "staged", "/ roofline", "Conv", "dpbu3", f"wrote {path}"):
         assert text in printed
 
 
 def test_the_same_network_in_stages_computes_the_same(measured):
     fused, staged = read_rows(measured[0])
     assert staged.flop == pytest.approx(fused.flop, rel=1e-3)  # small things that several stages need are done in each
-    assert fused.floor_flop == staged.floor_flop == min(fused.flop, staged.flop)
+    assert fused.roofline_flop == staged.roofline_flop == min(fused.flop, staged.flop)
     assert fused.depth_error is None
     assert staged.depth_error < 1e-3
 
@@ -123,7 +123,7 @@ def test_networks_run_in_pytorch():
 
 
 def test_the_machine_is_measured():
-    _, run = matrix()
+    _, run = gemm()
     assert run() > 1e8
 
 
@@ -161,7 +161,7 @@ def test_a_process_that_fails_says_why():
 
 def a_row(**changes) -> Row:
     row = Row(
-        "m.onnx", "p", "float32", "CPU", 2, 64, 96, seconds=[1.0, 1.1, 1.2, 1.3], rates=[1e9] * 4, peak_bytes=1000
+        "m.onnx", "p", "float32", "CPU", 2, 64, 96, seconds=[1.0, 1.1, 1.2, 1.3], gemm_rates=[1e9] * 4, peak_bytes=1000
     )
     return replace(row, **changes)
 
@@ -173,8 +173,8 @@ def a_row(**changes) -> Row:
         ({"seconds": [1.1, 1.2, 1.3, 1.4]}, []),  # more than a twentieth, within the spread
         ({"seconds": [2.0, 2.2, 2.4, 2.6]}, ["slower"]),
         ({"seconds": [0.5, 0.5, 0.6, 0.6]}, []),
-        ({"seconds": [2.0, 2.2, 2.4, 2.6], "rates": [5e8] * 4}, []),  # the machine is half as fast today
-        ({"seconds": [1.0, 1.1, 1.2, 1.3], "rates": [2e9] * 4}, ["slower"]),
+        ({"seconds": [2.0, 2.2, 2.4, 2.6], "gemm_rates": [5e8] * 4}, []),  # the machine is half as fast today
+        ({"seconds": [1.0, 1.1, 1.2, 1.3], "gemm_rates": [2e9] * 4}, ["slower"]),
         ({"peak_bytes": 1040}, []),
         ({"peak_bytes": 1100}, ["more memory"]),
         ({"seconds": [9.0] * 4, "peak_bytes": 9000}, ["slower", "more memory"]),
@@ -192,12 +192,12 @@ def test_a_small_steady_loss_is_within_tolerance():
 
 
 def test_rows_survive_their_file(tmp_path):
-    row = a_row(eager_seconds=[2.0, 2.2, 2.4, 2.6], flop=10**9, floor_flop=5 * 10**8)
+    row = a_row(eager_seconds=[2.0, 2.2, 2.4, 2.6], flop=10**9, roofline_flop=5 * 10**8)
     write_rows(tmp_path / "rows.json", {}, [row])
     (again,) = read_rows(tmp_path / "rows.json")
     assert asdict(again) == asdict(row)
     assert again.to_eager == pytest.approx(0.5)
-    assert again.to_floor == pytest.approx(2 * 1.15)
+    assert again.to_roofline == pytest.approx(2 * 1.15)
 
 
 def test_the_command_compares(exported, measured, tmp_path, capsys):
@@ -255,11 +255,19 @@ def test_bad_input_gets_one_line(arguments, expected, tmp_path, monkeypatch, cap
     assert printed.count("\n") == 1
 
 
-@pytest.mark.parametrize("content", ["", "[]", '{"rows": [{}]}', '{"rows": 1}'])
+@pytest.mark.parametrize("content", ["", "[]", '{"version": 2, "rows": [{}]}', '{"version": 2, "rows": 1}'])
 def test_files_that_are_no_benchmark_are_refused(content, tmp_path, capsys):
     (tmp_path / "old.json").write_text(content)
     assert run_command(bench.main, "--compare", tmp_path / "old.json") == 2
     assert "what --json" in capsys.readouterr().err
+
+
+def test_a_json_of_an_older_layout_is_named_in_one_line(tmp_path, capsys):
+    (tmp_path / "old.json").write_text('{"machine": {}, "rows": [{"model": "m.onnx", "floor_flop": 1}]}')
+    assert run_command(bench.main, "--compare", tmp_path / "old.json") == 2
+    printed = capsys.readouterr().err
+    assert "old.json: is of an older layout" in printed
+    assert printed.count("\n") == 1
 
 
 def test_environment_is_left_as_it_was(monkeypatch):

@@ -1,4 +1,4 @@
-"""The methods beside the model: a plane's pictures are known exactly, so best plane and true depth must draw them."""
+"""The methods beside the model: a plane's images are known exactly, so best plane and true depth must draw them."""
 
 from dataclasses import replace
 
@@ -9,11 +9,17 @@ from idesplat.runtime.images.io import find_images
 from idesplat.runtime.splats.points import unproject
 from idesplat.runtime.views.batch import match
 from idesplat.runtime.views.depth_range import DepthRange
-from idesplat.tools.evaluation.baselines import SPLAT_PIXELS, best_plane, nearest_view, splats_at, warp_plane
-from idesplat.tools.evaluation.cases import Posed, procedural_case, seen_by
+from idesplat.tools.evaluation.baselines import (
+    SPLAT_PIXELS,
+    best_fronto_parallel_plane,
+    nearest_view,
+    oracle_depth_splats,
+    warp_plane,
+)
+from idesplat.tools.evaluation.cases import PosedImages, find_covisible, procedural_case
 from idesplat.tools.evaluation.image_folders import load_case
 from idesplat.tools.evaluation.metrics import psnr
-from idesplat.tools.evaluation.novel_views import draw
+from idesplat.tools.evaluation.novel_views import render_target
 from idesplat.tools.synthetic.sampler import HELD_OUT_SEEDS, look_at
 
 HEIGHT, WIDTH, DEPTH = 60, 80, 4.0
@@ -22,7 +28,7 @@ STRAIGHT = np.eye(4)
 
 
 def wall(pose: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    """A camera's picture of the painted wall z = DEPTH, by intersecting rays, [3, HEIGHT, WIDTH] float32."""
+    """A camera's image of the painted wall z = DEPTH, by intersecting rays, [3, HEIGHT, WIDTH] float32."""
     x, y = np.meshgrid((np.arange(WIDTH) + 0.5) / WIDTH, (np.arange(HEIGHT) + 0.5) / HEIGHT)
     rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(intrinsics).T @ pose[:3, :3].T
     places = pose[:3, 3] + rays * ((DEPTH - pose[2, 3]) / rays[..., 2])[..., None]
@@ -31,11 +37,11 @@ def wall(pose: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
     return (0.5 + 0.4 * np.stack(paint)).astype(np.float32)
 
 
-def posed(poses: list[np.ndarray], intrinsics: np.ndarray = INTRINSICS) -> Posed:
+def posed(poses: list[np.ndarray], intrinsics: np.ndarray = INTRINSICS) -> PosedImages:
     images = np.stack([wall(pose, intrinsics) for pose in poses])
     valid = np.ones((len(poses), HEIGHT, WIDTH), bool)
     names = [str(index) for index in range(len(poses))]
-    return Posed(names, images, np.stack(poses), np.stack([intrinsics] * len(poses)), valid)
+    return PosedImages(names, images, np.stack(poses), np.stack([intrinsics] * len(poses)), valid)
 
 
 CONTEXT = [
@@ -44,28 +50,28 @@ CONTEXT = [
 ]
 
 
-def inner(picture: np.ndarray) -> np.ndarray:
-    return picture[8:-8, 8:-8]
+def inner(image: np.ndarray) -> np.ndarray:
+    return image[8:-8, 8:-8]
 
 
 @pytest.mark.parametrize(("near", "far"), [(0.5, 100.0), (2.0, 9.0), (5.0, 9.0), (1.0, 3.0)])
 def test_finds_the_plane_that_all_is_on(near: float, far: float) -> None:
     context, target = posed(CONTEXT), posed([STRAIGHT])
     everywhere = np.ones((HEIGHT, WIDTH), bool)
-    picture, depth = best_plane(context, target.picture(0), everywhere, STRAIGHT, target.K(0), near, far)
+    image, depth = best_fronto_parallel_plane(context, target.image(0), everywhere, STRAIGHT, target.K(0), near, far)
     assert depth == pytest.approx(DEPTH, rel=5e-3)
-    assert picture.shape == (HEIGHT, WIDTH, 3)
-    np.testing.assert_allclose(inner(picture), inner(target.picture(0)), atol=0.02)
-    copied = context.picture(nearest_view(context, STRAIGHT))
-    assert np.abs(inner(copied) - inner(target.picture(0))).max() > 0.3
+    assert image.shape == (HEIGHT, WIDTH, 3)
+    np.testing.assert_allclose(inner(image), inner(target.image(0)), atol=0.02)
+    copied = context.image(nearest_view(context, STRAIGHT))
+    assert np.abs(inner(copied) - inner(target.image(0))).max() > 0.3
 
 
 def test_pixels_that_do_not_count_do_not_decide() -> None:
     context, target = posed(CONTEXT), posed([STRAIGHT])
     valid = np.ones((HEIGHT, WIDTH), bool)
     valid[:, : WIDTH // 2] = False
-    truth = np.where(valid[..., None], target.picture(0), np.random.default_rng(0).random((HEIGHT, WIDTH, 3)))
-    _, depth = best_plane(context, truth.astype(np.float32), valid, STRAIGHT, target.K(0), 0.5, 100.0)
+    truth = np.where(valid[..., None], target.image(0), np.random.default_rng(0).random((HEIGHT, WIDTH, 3)))
+    _, depth = best_fronto_parallel_plane(context, truth.astype(np.float32), valid, STRAIGHT, target.K(0), 0.5, 100.0)
     assert depth == pytest.approx(DEPTH, rel=5e-3)
 
 
@@ -74,35 +80,35 @@ def test_what_a_view_did_not_see_is_taken_from_another() -> None:
     context.images[0][:, :, 20:60] = 0
     context.valid[0][:, 20:60] = False
     target = posed([STRAIGHT])
-    picture = warp_plane(context, STRAIGHT, target.K(0), 1 / DEPTH)
+    image = warp_plane(context, STRAIGHT, target.K(0), 1 / DEPTH)
     # a pixel beside the hole is still mixed from it and a black one
-    close = np.abs(inner(picture) - inner(target.picture(0))).max(axis=2) < 0.02
+    close = np.abs(inner(image) - inner(target.image(0))).max(axis=2) < 0.02
     assert close.mean() > 0.9
 
 
 def test_a_view_at_the_target_is_shown_as_it_is() -> None:
     context = posed([CONTEXT[0], STRAIGHT])
-    np.testing.assert_allclose(warp_plane(context, STRAIGHT, context.K(1), 0.7), context.picture(1), atol=1e-4)
+    np.testing.assert_allclose(warp_plane(context, STRAIGHT, context.K(1), 0.7), context.image(1), atol=1e-4)
 
 
 def test_the_nearest_view_fills_what_none_sees() -> None:
     behind = [look_at(np.array([x, 0.0, 0.0]), np.array([0.0, 0.1, -5.0])) for x in (0.3, -0.2)]
     context = posed(behind)
     assert nearest_view(context, STRAIGHT) == 1
-    np.testing.assert_array_equal(warp_plane(context, STRAIGHT, context.K(0), 1 / DEPTH), context.picture(1))
+    np.testing.assert_array_equal(warp_plane(context, STRAIGHT, context.K(0), 1 / DEPTH), context.image(1))
 
 
 def test_no_plane_of_a_dense_sweep_is_better(scene) -> None:
     """On a furnished room, where no plane fits."""
     frames = match(find_images([scene / "images"]), read_cameras(scene / "transforms.json"))
     case = load_case(frames, [1, 3], [2], (64, 96), lambda views: DepthRange(0.5, 100.0, "guessed"))
-    context, truth, valid = case.context, case.targets.picture(0), case.targets.valid[0]
+    context, truth, valid = case.context, case.targets.image(0), case.targets.valid[0]
     pose, K = case.targets.extrinsics[0], case.targets.K(0)
-    picture, depth = best_plane(context, truth, valid, pose, K, 0.5, 100.0)
+    image, depth = best_fronto_parallel_plane(context, truth, valid, pose, K, 0.5, 100.0)
     sweep = [psnr(warp_plane(context, pose, K, inverse), truth, valid) for inverse in np.linspace(0.01, 2, 800)]
-    assert psnr(picture, truth, valid) > max(sweep) - 0.02
-    np.testing.assert_allclose(picture, warp_plane(context, pose, K, 1 / depth), atol=1e-3)
-    assert psnr(picture, truth, valid) > psnr(context.picture(nearest_view(context, pose)), truth, valid) + 1
+    assert psnr(image, truth, valid) > max(sweep) - 0.02
+    np.testing.assert_allclose(image, warp_plane(context, pose, K, 1 / depth), atol=1e-3)
+    assert psnr(image, truth, valid) > psnr(context.image(nearest_view(context, pose)), truth, valid) + 1
 
 
 def wall_depth(pose: np.ndarray) -> np.ndarray:
@@ -116,10 +122,10 @@ def test_splats_at_the_true_depth_draw_the_wall() -> None:
     context, target = posed(CONTEXT), posed([STRAIGHT])
     depth = np.stack([wall_depth(pose) for pose in CONTEXT])
     np.testing.assert_allclose(unproject(depth[:1], context.extrinsics[:1], context.intrinsics[:1])[..., 2], DEPTH)
-    drawn = draw(splats_at(depth, context), target, 0)
-    np.testing.assert_allclose(inner(drawn.rgb), inner(target.picture(0)), atol=0.05)
-    off = draw(splats_at(1.5 * depth, context), target, 0)
-    assert np.abs(inner(off.rgb) - inner(target.picture(0))).max() > 0.15
+    drawn = render_target(oracle_depth_splats(depth, context), target, 0)
+    np.testing.assert_allclose(inner(drawn.rgb), inner(target.image(0)), atol=0.05)
+    off = render_target(oracle_depth_splats(1.5 * depth, context), target, 0)
+    assert np.abs(inner(off.rgb) - inner(target.image(0))).max() > 0.15
 
 
 def test_seen_is_what_no_surface_hides_and_no_border_cuts_off() -> None:
@@ -142,17 +148,19 @@ def test_seen_is_what_no_surface_hides_and_no_border_cuts_off() -> None:
         (right, y, -DEPTH): False,
     }
     points = np.array([[point(*place) for place in expected]])
-    np.testing.assert_array_equal(seen_by(points, depth, views), [list(expected.values())])
+    np.testing.assert_array_equal(find_covisible(points, depth, views), [list(expected.values())])
 
 
 def test_splats_seen_closer_want_to_be_larger() -> None:
-    """At the true depth 0.3 pixels beat 0.45 as large as the photographs, and leave gaps four times as large."""
+    """At the true depth 0.3 pixels beat 0.45 as large as the images, and leave gaps four times as large."""
     better = {}
     for closer in (1, 4):
         case = procedural_case(HELD_OUT_SEEDS[1], 2, 2, 1, 128, 128, closer)
-        rule = splats_at(case.depth, case.context)
+        rule = oracle_depth_splats(case.depth, case.context)
         small, large = (replace(rule, scales=rule.scales * np.float32(pixels / SPLAT_PIXELS)) for pixels in (0.3, 0.45))
-        truth, seen = case.targets.picture(0), case.seen[0]
-        better[closer] = np.subtract(*(psnr(draw(scene, case.targets, 0).rgb, truth, seen) for scene in (large, small)))
-        assert psnr(draw(large, case.targets, 0).rgb, truth, seen) > 20
+        truth, seen = case.targets.image(0), case.covisible[0]
+        better[closer] = np.subtract(
+            *(psnr(render_target(scene, case.targets, 0).rgb, truth, seen) for scene in (large, small))
+        )
+        assert psnr(render_target(large, case.targets, 0).rgb, truth, seen) > 20
     assert better[1] < 0 < better[4]

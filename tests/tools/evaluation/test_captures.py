@@ -21,7 +21,7 @@ from idesplat.tools.evaluation.checkouts import extract, fetch_checkout, find_ch
 from idesplat.tools.evaluation.choose_captures import as_json, camera_entries
 from idesplat.tools.evaluation.cli import main
 from idesplat.tools.evaluation.metrics import HIGHEST_PSNR, fit_exposure, psnr
-from idesplat.tools.evaluation.novel_views import draw
+from idesplat.tools.evaluation.novel_views import render_target
 
 TRAINED_ON = {"vork/maryRose", "alicevision/dataset_buddha"}
 KINDS = {"room", "object", "facade", "vegetation", "aerial"}
@@ -46,7 +46,7 @@ def repository(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[P
     git(root, "config", "uploadpack.allowFilter", "true")
     git(root, "config", "uploadpack.allowAnySHA1InWant", "true")
     git(root, "add", ".")
-    git(root, "commit", "--quiet", "--message", "photographs")
+    git(root, "commit", "--quiet", "--message", "images")
     return root, git(root, "rev-parse", "HEAD")
 
 
@@ -212,8 +212,8 @@ def test_the_command_measures_what_the_library_gives(
     case = images.case(["000.png", "002.png", "004.png"], ["001.png", "003.png"], opened.depth_range)
     context = case.context
     prediction = opened.predict_arrays(context.images, context.extrinsics, context.intrinsics, case.near, case.far)
-    truth = case.targets.picture(1)
-    rendered = draw(prediction.need_gaussians(), case.targets, 1).rgb
+    truth = case.targets.image(1)
+    rendered = render_target(prediction.need_gaussians(), case.targets, 1).rgb
     expected = -10 * np.log10(np.mean((rendered.clip(0, 1) - truth) ** 2))
 
     (entry,) = content["captures"]
@@ -226,7 +226,10 @@ def test_the_command_measures_what_the_library_gives(
     assert scores["model"]["psnr_fitted"] >= scores["model"]["psnr"]
     gaussians = prediction.need_gaussians()
     inputs = [
-        -10 * np.log10(np.mean((draw(gaussians, case.context, view).rgb.clip(0, 1) - case.context.picture(view)) ** 2))
+        -10
+        * np.log10(
+            np.mean((render_target(gaussians, case.context, view).rgb.clip(0, 1) - case.context.image(view)) ** 2)
+        )
         for view in range(3)
     ]
     assert window["input_psnr"] == pytest.approx(np.mean(inputs), abs=1e-3)
@@ -235,9 +238,9 @@ def test_the_command_measures_what_the_library_gives(
     of_two = opened.predict_arrays(
         pair.context.images, pair.context.extrinsics, pair.context.intrinsics, pair.near, pair.far
     )
-    by_two = psnr(draw(of_two.need_gaussians(), pair.targets, 0).rgb, truth, pair.targets.valid[0])
+    by_two = psnr(render_target(of_two.need_gaussians(), pair.targets, 0).rgb, truth, pair.targets.valid[0])
     assert scores["pairs"]["psnr"] == pytest.approx(by_two, abs=1e-3)
-    assert scores["plane"]["psnr"] >= scores["nearest"]["psnr"] > 5
+    assert scores["oracle_plane"]["psnr"] >= scores["nearest"]["psnr"] > 5
     mean = np.mean([target["scores"]["model"]["psnr"] for target in window["targets"]])
     assert content["mean"]["3"]["model"]["psnr"] == pytest.approx(mean)
 

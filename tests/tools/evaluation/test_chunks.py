@@ -12,11 +12,11 @@ import torch
 from idesplat.runtime.cameras.io import read_cameras
 from idesplat.runtime.errors import InputError
 from idesplat.tools.evaluation import chunks
-from idesplat.tools.evaluation.chunks import Entry, chunk_cases, find_chunks, read_chunk, read_index
+from idesplat.tools.evaluation.chunks import IndexEntry, chunk_cases, find_chunks, read_chunk, read_index
 from PIL import Image
 from scene_files import as_scene
 
-SIZE, RANGE = (64, 64), (0.5, 100.0)  # of photographs 96 x 128
+SIZE, RANGE = (64, 64), (0.5, 100.0)  # of images 96 x 128
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def no_skip(key: str, reason: str) -> None:
 
 
 def test_cases_are_the_indexed_frames_as_the_papers_prepare_them(folder: Path, scene: Path) -> None:
-    index = {"b": Entry([0, 4], [1, 3]), "d": Entry([1, 2, 3], [2])}
+    index = {"b": IndexEntry([0, 4], [1, 3]), "d": IndexEntry([1, 2, 3], [2])}
     first, second = chunk_cases(find_chunks(folder), index, SIZE, RANGE, no_skip)
     assert (first.name, first.context.names, first.targets.names) == ("b", ["0", "4"], ["1", "3"])
     assert (second.name, second.context.names, second.targets.names) == ("d", ["1", "2", "3"], ["2"])
@@ -41,16 +41,16 @@ def test_cases_are_the_indexed_frames_as_the_papers_prepare_them(folder: Path, s
     cameras = read_cameras(scene / "transforms.json")
     np.testing.assert_allclose(first.context.extrinsics[1], cameras[4].extrinsics, atol=1e-5)
     encoded = as_scene(scene, "")["images"][3].numpy()
-    picture = Image.fromarray(cv2.cvtColor(cv2.imdecode(encoded, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB))
-    expected = np.asarray(picture.resize((85, 64), Image.Resampling.LANCZOS))[:, 10:74] / 255
-    np.testing.assert_allclose(first.targets.picture(1), expected, atol=1.5 / 255)
+    image = Image.fromarray(cv2.cvtColor(cv2.imdecode(encoded, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB))
+    expected = np.asarray(image.resize((85, 64), Image.Resampling.LANCZOS))[:, 10:74] / 255
+    np.testing.assert_allclose(first.targets.image(1), expected, atol=1.5 / 255)
     assert first.targets.images.dtype == np.float32
 
 
 def test_intrinsics_follow_the_crop(folder: Path, scene: Path) -> None:
-    (case,) = chunk_cases(find_chunks(folder), {"a": Entry([0, 1], [2])}, SIZE, RANGE, no_skip)
+    (case,) = chunk_cases(find_chunks(folder), {"a": IndexEntry([0, 1], [2])}, SIZE, RANGE, no_skip)
     K = read_cameras(scene / "transforms.json")[2].K
-    x, y, _ = K @ (0.1, -0.05, 1)  # in the photograph
+    x, y, _ = K @ (0.1, -0.05, 1)  # in the image
     expected = x * 85 / 128 - 10, y * 64 / 96  # scaled to 85 x 64, cut from column 10
     np.testing.assert_allclose((case.targets.K(0) @ (0.1, -0.05, 1))[:2], expected, atol=1e-4)
 
@@ -58,7 +58,7 @@ def test_intrinsics_follow_the_crop(folder: Path, scene: Path) -> None:
 def test_reads_a_published_index(tmp_path: Path) -> None:
     path = tmp_path / "index.json"
     path.write_text('{"x": null, "5aca87f95a9412c6": {"context": [58, 133], "target": [84, 102, 129]}}')
-    assert read_index(path) == {"5aca87f95a9412c6": Entry([58, 133], [84, 102, 129])}
+    assert read_index(path) == {"5aca87f95a9412c6": IndexEntry([58, 133], [84, 102, 129])}
 
 
 @pytest.mark.parametrize(
@@ -166,7 +166,7 @@ def test_refuses_damaged_chunks(folder: Path) -> None:
 
 def test_an_index_of_another_dataset(folder: Path) -> None:
     with pytest.raises(InputError, match="scene c has 5 frames and the index asks for number 58"):
-        list(chunk_cases(find_chunks(folder), {"c": Entry([0, 58], [1])}, SIZE, RANGE, no_skip))
+        list(chunk_cases(find_chunks(folder), {"c": IndexEntry([0, 58], [1])}, SIZE, RANGE, no_skip))
 
 
 @pytest.mark.parametrize(
@@ -184,7 +184,7 @@ def test_skips_scenes_that_are_damaged(spoil: Callable, expected: str, scene: Pa
     spoil(content)
     torch.save([content, as_scene(scene, "b")], tmp_path / "0.torch")
     skipped: dict[str, str] = {}
-    index = {key: Entry([0, 1], [2]) for key in "ab"}
+    index = {key: IndexEntry([0, 1], [2]) for key in "ab"}
     (case,) = chunk_cases(find_chunks(tmp_path), index, SIZE, RANGE, skipped.__setitem__)
     assert case.name == "b" and list(skipped) == ["a"]
     with pytest.raises(InputError, match=expected):

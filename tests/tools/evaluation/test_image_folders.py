@@ -1,4 +1,4 @@
-"""Which photographs are held out and which are the context, and which of their pixels count."""
+"""Which images are held out and which are the context, and which of their pixels count."""
 
 import json
 import shutil
@@ -17,7 +17,7 @@ from idesplat.runtime.views.depth_range import DepthRange
 from idesplat.tools.evaluation.image_folders import Frame, chosen_frames, context_for, load_case
 from idesplat.tools.synthetic.sampler import look_at
 
-SIZE = HEIGHT, WIDTH = 64, 96  # of photographs 96 x 128: scaled to 72 x 96, four rows cut above and below
+SIZE = HEIGHT, WIDTH = 64, 96  # of images 96 x 128: scaled to 72 x 96, four rows cut above and below
 
 
 def find_range(views: Views) -> DepthRange:
@@ -69,7 +69,7 @@ def test_context_lies_around_the_target() -> None:
 @pytest.mark.parametrize(
     ("context", "targets", "views", "expected"),
     [
-        (["0006", "0099"], ["0007"], 2, "--context 0099: the name of none of 9 photographs"),
+        (["0006", "0099"], ["0007"], 2, "--context 0099: the name of none of 9 images"),
         (["0006", "0008"], ["7"], 2, "--target 7: the name of none"),
         (["0006", "0008"], ["0006"], 2, "0006.jpg is named twice"),
         (["0006", "0006"], ["0007"], 2, "0006.jpg is named twice"),
@@ -106,7 +106,7 @@ def test_black_borders_do_not_count(scene: Path, tmp_path: Path) -> None:
     shutil.copytree(scene, tmp_path / "scene")
     path = tmp_path / "scene" / "images" / "002.png"
     image = cv2.imread(str(path))
-    image[:, :16] = 3  # as an undistorted photograph has it
+    image[:, :16] = 3  # as an undistorted image has it
     image[50:56, 60:70] = 0  # something black in the middle
     cv2.imwrite(str(path), image)
     case = load_case(frames_of(tmp_path / "scene"), [0, 4], [2], SIZE, find_range)
@@ -125,7 +125,7 @@ def test_what_the_lens_did_not_see_does_not_count(scene: Path) -> None:
 
 @pytest.mark.parametrize("along", ["rows", "columns"])
 def test_true_depth_at_the_pixels_of_the_network(along: str, scene: Path, tmp_path: Path) -> None:
-    """Depth that grows by one a pixel of the photograph tells where it was taken: within half a pixel."""
+    """Depth that grows by one a pixel of the image tells where it was taken: within half a pixel."""
     y, x = np.meshgrid(np.arange(96) + 0.5, np.arange(128) + 0.5, indexing="ij")
     for name in ("000", "004"):
         np.savez(tmp_path / f"{name}.npz", depth=y if along == "rows" else x)

@@ -11,44 +11,44 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 EVERYWHERE = np.ones((40, 56), bool)
 
 
-def pictures(seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """A picture with structure at several scales, and a worse one of the same thing."""
+def images(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """A image with structure at several scales, and a worse one of the same thing."""
     rng = np.random.default_rng(seed)
     truth = sum(cv2.resize(rng.random((n, n, 3)), (56, 40), interpolation=cv2.INTER_CUBIC) for n in (3, 9, 40)) / 3
-    picture = cv2.GaussianBlur(truth, (5, 5), 1.2) + 0.05 * rng.standard_normal(truth.shape)
-    return picture.clip(0, 1), truth.clip(0, 1)
+    image = cv2.GaussianBlur(truth, (5, 5), 1.2) + 0.05 * rng.standard_normal(truth.shape)
+    return image.clip(0, 1), truth.clip(0, 1)
 
 
-def skimage_ssim(picture: np.ndarray, truth: np.ndarray) -> tuple[float, np.ndarray]:
+def skimage_ssim(image: np.ndarray, truth: np.ndarray) -> tuple[float, np.ndarray]:
     """As the releases call it, and the map."""
     options = {"win_size": 11, "gaussian_weights": True, "data_range": 1.0, "channel_axis": 2}
-    return structural_similarity(truth, picture, full=True, **options)
+    return structural_similarity(truth, image, full=True, **options)
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_psnr_and_ssim_against_scikit_image(seed: int) -> None:
-    picture, truth = pictures(seed)
-    assert psnr(picture, truth, EVERYWHERE) == pytest.approx(peak_signal_noise_ratio(truth, picture, data_range=1.0))
-    expected, _ = skimage_ssim(picture, truth)
+    image, truth = images(seed)
+    assert psnr(image, truth, EVERYWHERE) == pytest.approx(peak_signal_noise_ratio(truth, image, data_range=1.0))
+    expected, _ = skimage_ssim(image, truth)
     assert 0.2 < expected < 0.95
-    assert ssim(picture, truth, EVERYWHERE) == pytest.approx(expected, abs=1e-9)
-    single = ssim(picture.astype(np.float32), truth.astype(np.float32), EVERYWHERE)
-    assert single == pytest.approx(skimage_ssim(picture.astype(np.float32), truth.astype(np.float32))[0], abs=1e-5)
+    assert ssim(image, truth, EVERYWHERE) == pytest.approx(expected, abs=1e-9)
+    single = ssim(image.astype(np.float32), truth.astype(np.float32), EVERYWHERE)
+    assert single == pytest.approx(skimage_ssim(image.astype(np.float32), truth.astype(np.float32))[0], abs=1e-5)
 
 
 def test_only_valid_pixels_count() -> None:
-    picture, truth = pictures(5)
+    image, truth = images(5)
     valid = EVERYWHERE.copy()
     valid[:, 50:] = False
     valid[3, 2] = False
-    spoilt = np.where(valid[..., None], picture, 7.0)
-    assert psnr(spoilt, truth, valid) == pytest.approx(-10 * np.log10(np.mean((picture - truth)[valid] ** 2)))
-    _, similarity = skimage_ssim(picture, truth)
+    spoilt = np.where(valid[..., None], image, 7.0)
+    assert psnr(spoilt, truth, valid) == pytest.approx(-10 * np.log10(np.mean((image - truth)[valid] ** 2)))
+    _, similarity = skimage_ssim(image, truth)
     whole = np.zeros_like(valid)
-    whole[5:35, 5:45] = True  # windows inside of the picture and left of column 50 ...
+    whole[5:35, 5:45] = True  # windows inside of the image and left of column 50 ...
     whole[5:9, 5:8] = False  # ... and off the single pixel
     assert ssim(spoilt, truth, valid) == pytest.approx(similarity[whole].mean(), abs=1e-9)
-    assert np.isnan(ssim(picture, truth, np.zeros_like(valid)))
+    assert np.isnan(ssim(image, truth, np.zeros_like(valid)))
 
 
 def test_psnr_by_hand() -> None:
@@ -59,10 +59,12 @@ def test_psnr_by_hand() -> None:
 
 
 def test_depth_measures_by_hand() -> None:
-    truth = np.array([[[1.0, 2.0, 4.0, 0.0, np.inf, np.nan]]], np.float32)
-    found = depth_measures(np.array([[[1.02, 1.5, 5.0, 9.0, 9.0, 9.0]]], np.float32), truth)
-    assert found["abs_rel"] == pytest.approx((0.02 + 0.25 + 0.25) / 3, rel=1e-5)
-    assert found["within_5_percent"] == pytest.approx(1 / 3)
+    truth = np.array([[[1.0, 2.0, 4.0, 1.0, 0.0, np.inf, np.nan]]], np.float32)
+    found = depth_measures(np.array([[[1.02, 1.5, 4.5, 0.951, 9.0, 9.0, 9.0]]], np.float32), truth)
+    assert found["abs_rel"] == pytest.approx((0.02 + 0.25 + 0.125 + 0.049) / 4, rel=1e-5)
+    assert found["delta_1.25"] == pytest.approx(3 / 4)  # 2 / 1.5 is above
+    assert found["inlier_ratio_1.05"] == pytest.approx(1 / 4)  # 1 / 0.951 is above
+    assert depth_measures(np.zeros((1, 2, 2)), np.ones((1, 2, 2)))["delta_1.25"] == 0
 
 
 @pytest.mark.parametrize("package", ["torch", "lpips"])

@@ -1,6 +1,6 @@
 """The sparse products in ONNX Runtime, gathered at once and in steps: numbers for docs/performance.md.
 
-python -P -m idesplat.tools.benchmark.matmuls
+python -P -m idesplat.tools.benchmark.gather_attention
 """
 
 import tempfile
@@ -20,7 +20,7 @@ from ...export.graph.gather_loops import FEW, chunked, lower_custom_ops
 from ...model.common.gather_attention import GatherAttention
 from ...runtime.cli.terminal import run
 from .cli import thread_environment
-from .components import race
+from .components import run_interleaved
 from .worker import Prepared
 
 PAIRS = 2
@@ -60,11 +60,11 @@ def main(
     """Time the correlation and the weighted sum of it, on two pairs of 256x256 views."""
     with thread_environment(threads):
         for name, shape in SHAPES.items():
-            contestants = {
+            candidates = {
                 "gathered at once": (products, shape, False, threads),
                 "in steps": (products, shape, True, threads),
             }
-            race(f"{name}: gathered dot and weighted sum", contestants, repeats)
+            run_interleaved(f"{name}: gathered dot and weighted sum", candidates, repeats)
 
 
 def products(shape: Shape, steps: bool, threads: int) -> Prepared:
