@@ -48,8 +48,8 @@ runs/textures:
 	find runs/textures.part \( -type l -o -size -60k -o -name '*.deb' \) ! -type d -delete
 	mv runs/textures.part runs/textures
 
-# The successor of the carried model, trained from nothing: some ten hours of two cores. Each command resumes where it was
-# stopped. How the carried weights were made: MODEL_CARD.md.
+# The successor of the bundled model, trained from nothing: some ten hours of two cores. Each command resumes where it was
+# stopped. How the bundled weights were made: MODEL_CARD.md.
 weights: setup runs/textures
 	$(BIN)/idesplat-train --out runs/lite --preset idesplat-lite --textures runs/textures --steps 24000 --batch 2 \
 		--processes 2 --precision bf16 --size 256 --seed 0

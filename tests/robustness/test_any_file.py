@@ -222,7 +222,7 @@ def read_capture_file(path: Path) -> None:
 
 def read_log(path: Path) -> None:
     log = TrainingLog(path, 2)
-    log.draw_curves(path.with_name("curves.png"), ["loss"])
+    log.plot_curves(path.with_name("curves.png"), ["loss"])
 
 
 def assert_one_line(error: Exception, path: Path) -> None:

@@ -76,11 +76,11 @@ def _measure(phase: str, candidate: Candidate, steps: int) -> dict[str, Any]:
 
 def _worker(phase: str, candidate: Candidate, steps: int) -> None:
     """What the process of a measurement does; it prints seconds, CPU seconds of all processes, scenes and shares."""
-    from ..training.parallel import Team, other_processes
+    from ..training.parallel import Team, spawn_workers
 
     with scratch_folder() as folder:
         run = _run_at(folder, phase, candidate, Team(0, candidate.processes))
-        with other_processes(candidate.processes, _other, folder, phase, candidate, steps):
+        with spawn_workers(candidate.processes, _other, folder, phase, candidate, steps):
             print(json.dumps(_timed_steps(run, steps)))
 
 
@@ -103,15 +103,15 @@ def _run_at(folder: Path, phase: str, candidate: Candidate, team: "Team") -> "Ru
 
 def _timed_steps(run: "Run", steps: int) -> dict[str, Any]:
     """Make some steps after the warm-up; CPU seconds are summed over the team."""
-    from ..training.scenes import drawn_ahead
+    from ..training.scenes import prefetch
 
-    scenes = drawn_ahead(run.orders(), run.task.load)
+    scenes = prefetch(run.specs(), run.task.load)
     for _ in range(WARM_UP):
-        run.one_step(scenes)
+        run.train_step(scenes)
     parts = _timed_parts(run)
     started, cpu = time.perf_counter(), time.process_time()
     for _ in range(steps):
-        run.one_step(_timed(scenes, parts))
+        run.train_step(_timed(scenes, parts))
     seconds, cpu = time.perf_counter() - started, time.process_time() - cpu
     scenes.close()
     total_cpu = sum(entry["cpu"] for entry in run.team.gather([{"cpu": cpu}]))
@@ -138,7 +138,7 @@ def _timed_parts(run: "Run") -> dict[str, float]:
         stage.forward = timed(name, stage.forward)
     changed: Any = run  # methods of single objects are replaced
     changed.task.loss = timed("rendering and losses", run.task.loss)
-    changed.team.sum_gradients = timed("waiting and exchange", run.team.sum_gradients)
+    changed.team.all_reduce_gradients = timed("waiting and exchange", run.team.all_reduce_gradients)
     changed.state.update = timed("optimiser", run.state.update)
     return parts
 

@@ -68,9 +68,9 @@ def procedural_case(
     pool: context views rendered along a path, of which `context` are given to the network, evenly spaced.
     closer: how many times as large targets are rendered as the context; they are windows of such images then.
     """
-    from ..synthetic.sampler import draw_sample
+    from ..synthetic.sampler import generate_sample
 
-    sample = draw_sample(seed, pool, targets, height, width, closer=(closer,) * targets)
+    sample = generate_sample(seed, pool, targets, height, width, target_zooms=(closer,) * targets)
     given = np.linspace(0, pool - 1, context).round().astype(int)
 
     def posed(kind: str, views: np.ndarray | slice) -> PosedImages:

@@ -22,7 +22,7 @@ ANY_KINDS = (
 )
 
 # Textures that are windows of photographs, and the share of the materials that have one, where there are any.
-PHOTO_KIND, PHOTO_SHARE = "photo", 0.5
+PHOTO_KIND, PHOTO_PROBABILITY = "photo", 0.5
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Builder:
         """Add a material with a texture of one of `kinds`, recoloured; `period`: its size in metres."""
         rng = self.rng
         kind = kinds[rng.integers(len(kinds))]
-        choices = self.photos if self.photos and rng.random() < PHOTO_SHARE else self.bank.of_kind(kind)
+        choices = self.photos if self.photos and rng.random() < PHOTO_PROBABILITY else self.bank.of_kind(kind)
         texture = choices[rng.integers(len(choices))]
         frequency = 1 / (period or np.exp(rng.uniform(np.log(0.3), np.log(2.0))))
         turn = rng.integers(4) * np.pi / 2 if rng.random() < 0.85 else rng.uniform(0, 2 * np.pi)
@@ -115,7 +115,7 @@ class Builder:
         )
 
 
-def draw_layout(rng: np.random.Generator, bank: Textures, outdoors: bool = False) -> Layout:
+def generate_layout(rng: np.random.Generator, bank: Textures, outdoors: bool = False) -> Layout:
     """A scene of a random kind; outdoors: with those kinds that are seen from outside, from above or all around."""
     layouts = LAYOUTS + OUTDOOR_LAYOUTS if outdoors else LAYOUTS
     return layouts[rng.integers(len(layouts))](rng, bank)

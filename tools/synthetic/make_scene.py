@@ -48,7 +48,7 @@ def make_scene(
     """Draw photographs of a furnished room that exists only in numbers, with its cameras and exact depth."""
     from ...runtime.images.writing import save_png
     from .layout import furnished_room
-    from .sampler import photograph, scene_textures
+    from .sampler import render, scene_textures
 
     images, depths, cameras = out_dir / "images", out_dir / "depth", out_dir / "transforms.json"
     names = [f"{index:03}" for index in range(views)]
@@ -63,7 +63,7 @@ def make_scene(
 
     exposure = 1.0
     for index, pose in enumerate(_with_progress(poses)):
-        image, depth = photograph(scene, bank, pose, intrinsics, height, width, SAMPLES)
+        image, depth = render(scene, bank, pose, intrinsics, height, width, SAMPLES)
         if index == 0:
             exposure = BRIGHTNESS / max(float(image.mean()), 1e-3)
         save_png(images / f"{index:03}.png", exposure * image)

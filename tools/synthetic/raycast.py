@@ -52,7 +52,7 @@ class Scene(NamedTuple):
     ambient: np.ndarray  # [3]
 
 
-def render(
+def cast_rays(
     scene: Scene,
     texels: np.ndarray,
     camera_to_world: np.ndarray,
@@ -153,7 +153,7 @@ def _cast(
     image: np.ndarray,
     depth: np.ndarray,
 ) -> None:
-    """`render`'s loop over tiles and pixels.
+    """`cast_rays`'s loop over tiles and pixels.
 
     order: the solids by rising `nearest`. solids: room for those of a tile.
     """

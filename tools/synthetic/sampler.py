@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from .layout import Layout, draw_layout
-from .raycast import Scene, render
+from .layout import Layout, generate_layout
+from .raycast import Scene, cast_rays
 from .textures import Textures, texture_bank
 
 # Results are reported on the held-out seeds alone; settings are chosen on the validation seeds. Neither's textures
@@ -16,7 +16,8 @@ TRAINING_SEEDS = range(0, 1_000_000_000)
 VALIDATION_SEEDS = range(1_000_000_000, 1_000_000_100)
 HELD_OUT_SEEDS = range(1_000_001_000, 1_000_001_200)
 
-WIDE_SHARE = 0.25  # of the samples have a depth range far wider than they fill, up to this ratio of far to near
+# Share of the samples whose depth range is far wider than the scene, and the largest ratio of far to near there.
+WIDE_RANGE_PROBABILITY = 0.25
 WIDEST = 200.0
 PROBE = 24  # pixels: the small depth map by which a camera is judged
 ATTEMPTS = 60  # to place the cameras of a sample
@@ -24,7 +25,7 @@ GOOD_OVERLAP = 0.6  # share of the first view's points that each other view shou
 
 
 @dataclass(frozen=True)
-class Spread:
+class CameraVariation:
     """How far the views of a capture differ, as shares: exposure, white balance; and how many are JPEG files."""
 
     exposure: float
@@ -33,7 +34,7 @@ class Spread:
 
 
 # Of training scenes, and of those that results are reported on.
-CAPTURE_SPREAD, HELD_OUT_SPREAD = Spread(0.08, 0.03, 0.5), Spread(0.05, 0.0, 0.0)
+TRAINING_VARIATION, HELD_OUT_VARIATION = CameraVariation(0.08, 0.03, 0.5), CameraVariation(0.05, 0.0, 0.0)
 JPEG_QUALITY = (60, 98)
 
 
@@ -65,43 +66,45 @@ def scene_textures(seed: int) -> Textures:
     return texture_bank(1, 260) if seed in TRAINING_SEEDS else texture_bank(2, 104)
 
 
-def draw_sample(
+def generate_sample(
     seed: int,
     context: int,
     targets: int,
     height: int,
     width: int,
     samples: int = 4,
-    closer: Sequence[int] = (),
+    target_zooms: Sequence[int] = (),
     bank: Textures | None = None,
 ) -> Sample:
     """The sample of `seed`: `context` views whose neighbours overlap, and `targets` views between and around them.
 
-    The same arguments give the same sample. samples: rays for a pixel's colour. closer: how many times as large as the
-    context each target is drawn, of which the picture is then a window somewhere; if empty, all are as large.
+    The same arguments give the same sample. samples: rays for a pixel's colour. target_zooms: each
+    target is a random crop of an image rendered that many times as large as the context images; if empty, all are 1.
     bank: textures instead of `scene_textures(seed)`.
     The first call in a process draws the textures (some seconds).
     """
     rng = np.random.default_rng(seed)
     training = seed in TRAINING_SEEDS
     bank = bank or scene_textures(seed)
-    layout = draw_layout(rng, bank, outdoors=training)
-    intrinsics = _draw_intrinsics(rng, context + targets, width / height)
-    extrinsics = _draw_cameras(rng, layout, intrinsics, context, targets)
-    for view, times in enumerate(closer, start=context):
-        if times > 1:
-            intrinsics[view] = window(intrinsics[view], times, rng.uniform(0, times - 1, 2))
+    layout = generate_layout(rng, bank, outdoors=training)
+    intrinsics = _sample_intrinsics(rng, context + targets, width / height)
+    extrinsics = _sample_poses(rng, layout, intrinsics, context, targets)
+    for view, zoom in enumerate(target_zooms, start=context):
+        if zoom > 1:
+            intrinsics[view] = crop_intrinsics(intrinsics[view], zoom, rng.uniform(0, zoom - 1, 2))
     views = [
-        photograph(layout.scene, bank, pose, k, height, width, samples)
+        render(layout.scene, bank, pose, k, height, width, samples)
         for pose, k in zip(extrinsics, intrinsics, strict=True)
     ]
     depth = np.stack([view_depth for _, view_depth in views])
-    scale, near, far = _draw_range(rng, depth)
+    scale, near, far = _sample_depth_range(rng, depth)
     extrinsics[:, :3, 3] *= scale
     brightness = float(np.mean([image.mean() for image, _ in views]))
     exposure = np.float32(np.clip(rng.uniform(0.33, 0.52) / max(brightness, 1e-3), 0.6, 2.5))
-    spread = CAPTURE_SPREAD if training else HELD_OUT_SPREAD
-    images = [_develop(rng, image * exposure, index < context, spread) for index, (image, _) in enumerate(views)]
+    variation = TRAINING_VARIATION if training else HELD_OUT_VARIATION
+    images = [
+        _simulate_camera(rng, image * exposure, index < context, variation) for index, (image, _) in enumerate(views)
+    ]
     return Sample(
         np.stack(images).transpose(0, 3, 1, 2).copy(),
         depth * np.float32(scale),
@@ -113,7 +116,7 @@ def draw_sample(
     )
 
 
-def photograph(
+def render(
     scene: Scene, bank: Textures, pose: np.ndarray, intrinsics: np.ndarray, height: int, width: int, samples: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Colour [height, width, 3], from 0, 1 for white, and z-depth [height, width] of a scene, both float32.
@@ -123,7 +126,7 @@ def photograph(
     """
     image, depth = np.zeros((height, width, 3), np.float32), np.empty((height, width), np.float32)
     (fx, _, cx), (_, fy, cy) = intrinsics[:2] * [[width], [height]]
-    render(scene, bank.texels, pose, (fx, fy, cx, cy), _sample_offsets(samples), image, depth)
+    cast_rays(scene, bank.texels, pose, (fx, fy, cx, cy), _sample_offsets(samples), image, depth)
     return image, depth
 
 
@@ -140,15 +143,18 @@ def look_at(eye: np.ndarray, focus: np.ndarray, roll: float = 0.0) -> np.ndarray
     return pose
 
 
-def window(intrinsics: np.ndarray, closer: int, corner: np.ndarray) -> np.ndarray:
-    """Normalised intrinsics [3, 3] of a window at `corner` [2], in windows, of a picture `closer` times as large."""
-    return np.diag([closer, closer, 1.0]) @ intrinsics - np.array([[0, 0, corner[0]], [0, 0, corner[1]], [0, 0, 0]])
+def crop_intrinsics(intrinsics: np.ndarray, zoom: int, corner: np.ndarray) -> np.ndarray:
+    """Normalised intrinsics [3, 3] of a crop of an image that is rendered `zoom` times as large.
+
+    corner: the crop's upper left corner [2], in units of the crop's size.
+    """
+    return np.diag([zoom, zoom, 1.0]) @ intrinsics - np.array([[0, 0, corner[0]], [0, 0, corner[1]], [0, 0, 0]])
 
 
 def probe(scene: Scene, pose: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
     """A small depth map [PROBE, PROBE]; zeros where the camera stands outside of everything."""
     bare = Textures(np.zeros((1, 1, 3), np.uint8), ())
-    _, depth = photograph(scene, bare, pose, intrinsics, PROBE, PROBE, 0)
+    _, depth = render(scene, bare, pose, intrinsics, PROBE, PROBE, 0)
     return depth if np.isfinite(depth).all() else np.zeros_like(depth)
 
 
@@ -165,7 +171,7 @@ def _sample_offsets(samples: int) -> np.ndarray:
     return np.stack([(index + 0.5) / max(samples, 1), radical_inverse + 0.5 / max(samples, 1)], axis=-1)
 
 
-def _draw_intrinsics(rng: np.random.Generator, views: int, aspect: float) -> np.ndarray:
+def _sample_intrinsics(rng: np.random.Generator, views: int, aspect: float) -> np.ndarray:
     """One camera, in a part of the samples slightly another for each view, normalised, [views, 3, 3]."""
     field_of_view = np.exp(rng.uniform(np.log(35), np.log(85)))  # degrees, of the longer side
     focal = 0.5 / np.tan(np.radians(field_of_view) / 2)
@@ -179,7 +185,7 @@ def _draw_intrinsics(rng: np.random.Generator, views: int, aspect: float) -> np.
     return intrinsics
 
 
-def _draw_cameras(
+def _sample_poses(
     rng: np.random.Generator, layout: Layout, intrinsics: np.ndarray, context: int, targets: int
 ) -> np.ndarray:
     """Poses [views, 4, 4] that see the scene from outside its solids and overlap; the best found if none is perfect."""
@@ -191,7 +197,7 @@ def _draw_cameras(
             continue
         if relief(seen) < 0.02 and rng.random() < 0.8:  # nothing but flat walls: some of those will do
             continue
-        poses = _draw_neighbours(rng, first, float(np.median(seen)), context, targets)
+        poses = _sample_neighbour_poses(rng, first, float(np.median(seen)), context, targets)
         score = min((_overlap(layout.scene, poses, intrinsics, seen, i) for i in range(1, len(poses))), default=1.0)
         if score > best_score:
             best, best_score = poses, score
@@ -204,7 +210,7 @@ def _draw_cameras(
     return best
 
 
-def _draw_neighbours(
+def _sample_neighbour_poses(
     rng: np.random.Generator, first: np.ndarray, distance: float, context: int, targets: int
 ) -> np.ndarray:
     """Context poses on a path from `first` on, a few to 30 % of `distance` apart, and targets between and around."""
@@ -238,17 +244,17 @@ def _overlap(scene: Scene, poses: np.ndarray, intrinsics: np.ndarray, seen: np.n
     return float(((places > 0) & (places < 1)).all(axis=-1).mean())
 
 
-def _draw_range(rng: np.random.Generator, depth: np.ndarray) -> tuple[float, float, float]:
+def _sample_depth_range(rng: np.random.Generator, depth: np.ndarray) -> tuple[float, float, float]:
     """The factor that brings the scene to its final units, in which near is 1; near and far there."""
     near = float(depth.min()) * rng.uniform(0.5, 0.95)
     far = float(depth.max()) * rng.uniform(1.05, 2.0)
-    if rng.random() < WIDE_SHARE:  # as where nothing is known of the scene
+    if rng.random() < WIDE_RANGE_PROBABILITY:  # as where nothing is known of the scene
         near *= rng.uniform(0.3, 1.0)
         far = max(far, near * np.exp(rng.uniform(np.log(10.0), np.log(WIDEST))))
     return 1 / near, 1.0, far / near
 
 
-def _develop(rng: np.random.Generator, image: np.ndarray, worn: bool, spread: Spread) -> np.ndarray:
+def _simulate_camera(rng: np.random.Generator, image: np.ndarray, worn: bool, spread: CameraVariation) -> np.ndarray:
     """The image [height, width, 3] as a camera gives it: `worn` by its own exposure, blur and noise."""
     if worn:
         image = image * np.float32(rng.uniform(1 - spread.exposure, 1 + spread.exposure))

@@ -19,8 +19,8 @@ from ...runtime.inference.normalization import SceneNormalization
 from ...runtime.views.batch import Views as Photographs
 from ...runtime.views.batch import prepare, take
 from ...runtime.views.depth_range import find_depth_range
-from ..synthetic.sampler import window
-from .scenes import Order, Views
+from ..synthetic.sampler import crop_intrinsics
+from .scenes import SampleSpec, Views
 
 CAMERAS = "transforms.json"
 # The other context views are drawn from this many cameras nearest to the first one, the targets from as many nearest
@@ -55,31 +55,31 @@ class FolderScenes:
             _check_enough(folder, len(self.for_training[-1]), len(self.held_out[-1]))
         self.trained = near, far
 
-    def draw(self, order: Order) -> Views:
+    def load(self, spec: SampleSpec) -> Views:
         """Context views near each other, and targets near them, none of them held out.
 
         A folder with too few photographs for the order's targets and context gives fewer context views.
         """
-        rng = np.random.default_rng(order.seed)
+        rng = np.random.default_rng(spec.seed)
         pairs = self.for_training[rng.integers(len(self.for_training))]
-        chosen = _choose(rng, pairs, len(order.closer), order.context)
-        count = len(chosen) - len(order.closer)
-        return self._views(rng, [pairs[index] for index in chosen[:count]], [pairs[i] for i in chosen[count:]], order)
+        chosen = _choose(rng, pairs, len(spec.target_zooms), spec.context)
+        count = len(chosen) - len(spec.target_zooms)
+        return self._views(rng, [pairs[index] for index in chosen[:count]], [pairs[i] for i in chosen[count:]], spec)
 
-    def draw_held_out(self, order: Order) -> Views:
+    def load_held_out(self, spec: SampleSpec) -> Views:
         """Held-out photographs as targets, and those for training that were taken nearest to them as context."""
-        rng = np.random.default_rng(order.seed)
+        rng = np.random.default_rng(spec.seed)
         folder = int(rng.integers(len(self.held_out)))
         held_out, pairs = self.held_out[folder], self.for_training[folder]
         first = int(rng.integers(len(held_out)))
-        targets = [held_out[index] for index in _nearest(held_out, held_out[first])[: max(len(order.closer), 1)]]
-        context = [pairs[index] for index in _nearest(pairs, targets[0])[: order.context]]
-        closer = order.closer[: len(targets)]
-        return self._views(rng, context, targets[: len(closer)], replace(order, closer=closer))
+        targets = [held_out[index] for index in _nearest(held_out, held_out[first])[: max(len(spec.target_zooms), 1)]]
+        context = [pairs[index] for index in _nearest(pairs, targets[0])[: spec.context]]
+        target_zooms = spec.target_zooms[: len(targets)]
+        return self._views(rng, context, targets[: len(target_zooms)], replace(spec, target_zooms=target_zooms))
 
-    def _views(self, rng: np.random.Generator, context: Pairs, targets: Pairs, order: Order) -> Views:
-        photographs = prepare([*context, *targets], None, order.height, order.width)
-        windows = [_target(rng, pair, closer, order) for pair, closer in zip(targets, order.closer, strict=True)]
+    def _views(self, rng: np.random.Generator, context: Pairs, targets: Pairs, spec: SampleSpec) -> Views:
+        photographs = prepare([*context, *targets], None, spec.height, spec.width)
+        windows = [_target(rng, pair, zoom, spec) for pair, zoom in zip(targets, spec.target_zooms, strict=True)]
         return self._to_views(photographs, len(context), windows)
 
     def _to_views(self, photographs: Photographs, context: int, targets: Sequence[tuple[Tensor, Tensor]]) -> Views:
@@ -101,13 +101,13 @@ class FolderScenes:
         )
 
 
-def _target(rng: np.random.Generator, pair: tuple[Path, Camera], closer: int, order: Order) -> tuple[Tensor, Tensor]:
-    """A window [3, height, width] of a photograph `closer` times as large as the context, and its intrinsics [3, 3]."""
-    large, intrinsics, _ = take(pair, closer * order.height, closer * order.width)
-    top, left = (int(rng.integers((closer - 1) * side + 1)) for side in (order.height, order.width))
-    image = large[:, top : top + order.height, left : left + order.width].copy()
-    corner = np.array([left / order.width, top / order.height])
-    return torch.from_numpy(image), torch.from_numpy(window(intrinsics, closer, corner).astype(np.float32))
+def _target(rng: np.random.Generator, pair: tuple[Path, Camera], zoom: int, spec: SampleSpec) -> tuple[Tensor, Tensor]:
+    """A crop [3, height, width] of an image `zoom` times as large as the context images, and its intrinsics [3, 3]."""
+    large, intrinsics, _ = take(pair, zoom * spec.height, zoom * spec.width)
+    top, left = (int(rng.integers((zoom - 1) * side + 1)) for side in (spec.height, spec.width))
+    image = large[:, top : top + spec.height, left : left + spec.width].copy()
+    corner = np.array([left / spec.width, top / spec.height])
+    return torch.from_numpy(image), torch.from_numpy(crop_intrinsics(intrinsics, zoom, corner).astype(np.float32))
 
 
 def _pairs(folder: Path) -> Pairs:

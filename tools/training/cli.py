@@ -19,7 +19,7 @@ import typer
 from ...runtime.cli.outputs import Overwrite, guards_outputs, outputs
 from ...runtime.cli.terminal import run, say
 from ...runtime.errors import InputError, exit_on_input_error
-from .schedule import Objective, Part, PerceptualKind, Phase, Precision, curriculum, phase_at, rate_at
+from .schedule import Objective, Part, PerceptualKind, Phase, Precision, lr_factor, phase_at, training_phases
 
 if TYPE_CHECKING:  # torch and compiled code are loaded only once there is something to train
     from ...model.config import IDESplatConfig
@@ -27,7 +27,7 @@ if TYPE_CHECKING:  # torch and compiled code are loaded only once there is somet
     from .log import TrainingLog
     from .losses import Perceptual
     from .parallel import Team
-    from .scenes import Order, Views
+    from .scenes import SampleSpec, Views
     from .tasks import TrainingTask
 
 CHECKPOINT, LOG, CURVES, PICTURES = "last.ckpt", "log.jsonl", "curves.png", "predictions.png"
@@ -47,7 +47,7 @@ class Settings:
 
     preset: str
     objective: str
-    gradual: bool
+    curriculum: bool
     steps: int
     batch: int
     size: int
@@ -73,7 +73,7 @@ def train(
     data: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Folder with photographs and transforms.json, instead of drawn scenes; every eighth is for validation."
+            help="Folder with photographs and transforms.json, instead of synthetic scenes; every eighth validates."
         ),
     ] = None,
     textures: Annotated[
@@ -92,7 +92,7 @@ def train(
         Path | None, typer.Option(help="With --train head: folder of cached features, instead of one inside of --out.")
     ] = None,
     objective: Annotated[Objective, typer.Option(help="True depth, rendered novel views, or both.")] = Objective.BOTH,
-    gradual: Annotated[
+    curriculum: Annotated[
         bool, typer.Option(help="Coarse depth first, then finer, then Gaussians; else everything from the start.")
     ] = True,
     steps: Annotated[int, typer.Option(help="Steps of the whole run.", min=1)] = 20000,
@@ -122,7 +122,7 @@ def train(
     settings = Settings(
         preset,
         objective.value,
-        gradual and not head,
+        curriculum and not head,
         steps,
         batch,
         size,
@@ -142,11 +142,11 @@ def train(
     _announce(out, init, data or [])
     if processes > batch:
         raise InputError(f"--processes {processes}: more than the {batch} scenes of a step; raise --batch")
-    from .parallel import Team, other_processes
+    from .parallel import Team, spawn_workers
 
     outputs().make_folder(out)
     training = Run(out, settings, config, features, Team(0, processes), threads)
-    with other_processes(processes, _work, out, settings, config, features, threads, validate_every):
+    with spawn_workers(processes, _work, out, settings, config, features, threads, validate_every):
         training.go(save_every * 60, validate_every)
 
 
@@ -193,14 +193,14 @@ class Run:
             self.state.resume(folder / CHECKPOINT, asdict(settings))
         elif settings.init:
             self.state.start_from(Path(settings.init))
-        self.source: Callable[[Order], Views]
-        self.held_out: Callable[[Order], Views]
+        self.source: Callable[[SampleSpec], Views]
+        self.held_out: Callable[[SampleSpec], Views]
         self.source, self.held_out = _sources(settings, config)
         self.task: TrainingTask[Any] = _task(settings, self.state.model, self.source, features or folder / FEATURES)
         self.phases = self.task.phases
         if not resumed:
             self.task.prepare(self.state.model)
-            self.state.reset_mean()
+            self.state.reset_ema()
         if settings.precision == Precision.BF16:
             from .mixed_precision import with_bfloat16
 
@@ -209,14 +209,14 @@ class Run:
 
     def go(self, save_every: float, validate_every: int) -> None:
         """Train to the last step. save_every: seconds; validate_every: steps."""
-        from .scenes import drawn_ahead
+        from .scenes import prefetch
 
         saved = time.monotonic()
         bar = Bar(self.settings.steps, self.state.step, shown=self.team.leads)
         with bar.progress:
-            scenes = drawn_ahead(self.orders(), self.task.load)
+            scenes = prefetch(self.specs(), self.task.load)
             while self.state.step < self.settings.steps:
-                entry = self.one_step(scenes)
+                entry = self.train_step(scenes)
                 if self.log is None:
                     continue
                 if self.state.step % validate_every == 0 or self.state.step == self.settings.steps:
@@ -237,13 +237,13 @@ class Run:
         """The phase of a step, counted from 0."""
         return phase_at(self.phases, step, self.settings.steps)
 
-    def orders(self) -> "Iterator[Order]":
+    def specs(self) -> "Iterator[SampleSpec]":
         """This process's scenes of every step from here on."""
         for step in range(self.state.step, self.settings.steps):
             for slot in self.team.share(self.settings.batch):
-                yield self.task.order(step, slot, self.phase(step))
+                yield self.task.spec(step, slot, self.phase(step))
 
-    def one_step(self, scenes: Iterator[Any]) -> dict[str, Any]:
+    def train_step(self, scenes: Iterator[Any]) -> dict[str, Any]:
         """Gather the gradients of a batch and step along them; returns what is logged."""
         from .log import finite
         from .parallel import mean_entries
@@ -255,8 +255,8 @@ class Run:
             loss, entry = self.task.loss(self.state.model, next(scenes), self.state.step, phase)
             (loss / batch).backward()
             entries.append(entry)
-        self.team.sum_gradients(self.state.model.parameters())
-        norm = self.state.update(rate_at(self.phases, self.state.step, self.settings.steps))
+        self.team.all_reduce_gradients(self.state.model.parameters())
+        norm = self.state.update(lr_factor(self.phases, self.state.step, self.settings.steps))
         means = {name: finite(value) for name, value in mean_entries(self.team.gather(entries)).items()}
         seconds = round(time.monotonic() - started, 3)
         return {"step": self.state.step, **means, "gradient": finite(norm), "seconds": seconds}
@@ -268,8 +268,8 @@ class Run:
 
         phase = self.phase(self.state.step - 1)
         side = self.settings.size // phase.shrink
-        found = validate(self.state.mean_model(), phase, side, self.held_out, self.folder / PICTURES)
-        log.draw_curves(self.folder / CURVES, CURVES_SHOWN)
+        found = validate(self.state.ema_model(), phase, side, self.held_out, self.folder / PICTURES)
+        log.plot_curves(self.folder / CURVES, CURVES_SHOWN)
         return {name: finite(value) for name, value in found.items()}
 
     def save(self) -> None:
@@ -311,7 +311,7 @@ def _config(settings: Settings) -> "IDESplatConfig":
             f"--objective {settings.objective}: photographs have no true depth; use photometric, or --real-ratio"
         )
     config = presets[settings.preset]
-    phases = curriculum(Objective(settings.objective), settings.gradual)
+    phases = training_phases(Objective(settings.objective), settings.curriculum)
     multiple = max(phase.shrink for phase in phases) * max(config.size_multiple, LEAST_SIDE)
     if settings.size % multiple:
         raise InputError(f"--size {settings.size}: must be a multiple of {multiple} for this preset and these phases")
@@ -336,42 +336,42 @@ def _announce(out: Path, init: Path | None, data: list[Path]) -> None:
 
 def _sources(
     settings: Settings, config: "IDESplatConfig"
-) -> "tuple[Callable[[Order], Views], Callable[[Order], Views]]":
+) -> "tuple[Callable[[SampleSpec], Views], Callable[[SampleSpec], Views]]":
     """What makes the views of training and of validation: synthetic scenes, the given folders, or both."""
     from ..synthetic.photo_textures import photo_textures
-    from .scenes import draw_views
+    from .scenes import generate_views
 
     photos = Path(settings.textures) if settings.textures else None
     if photos is not None:
         photo_textures(photos)
-    synthetic = partial(draw_views, photos=photos)
+    synthetic = partial(generate_views, photos=photos)
     if not settings.data:
         return synthetic, synthetic
     from .captures import FolderScenes
 
     captures = FolderScenes([Path(folder) for folder in settings.data], config.near, config.far)
     if settings.real_ratio == 1:
-        return captures.draw, captures.draw_held_out
+        return captures.load, captures.load_held_out
     return (
-        lambda order: captures.draw(order) if order.real else synthetic(order),
-        lambda order: captures.draw_held_out(order) if order.real else synthetic(order),
+        lambda spec: captures.load(spec) if spec.real else synthetic(spec),
+        lambda spec: captures.load_held_out(spec) if spec.real else synthetic(spec),
     )
 
 
 def _trained(settings: Settings) -> tuple[str, ...]:
     """The beginnings of the trained parameters' names."""
-    from .tasks import HeadTask, WholeTask
+    from .tasks import FullNetworkTask, HeadTask
 
-    return HeadTask.trained if settings.part == Part.HEAD else WholeTask.trained
+    return HeadTask.trained if settings.part == Part.HEAD else FullNetworkTask.trained
 
 
 def _task(
-    settings: Settings, model: "IDESplat", source: "Callable[[Order], Views]", features: Path
+    settings: Settings, model: "IDESplat", source: "Callable[[SampleSpec], Views]", features: Path
 ) -> "TrainingTask[Any]":
     """What the settings ask for; features: the folder of cached features."""
     from ...model.idesplat.gaussian_head import HeadInputs
     from .head import FeatureCache
-    from .tasks import HeadTask, WholeTask
+    from .tasks import FullNetworkTask, HeadTask
 
     size, batch = settings.size, settings.batch
     if settings.part == Part.HEAD:
@@ -380,9 +380,9 @@ def _task(
         )
         return HeadTask(cache, settings.seed, size, batch, settings.scenes, settings.real_ratio, _perceptual(settings))
     objective = Objective(settings.objective)
-    phases = curriculum(objective, settings.gradual)
+    phases = training_phases(objective, settings.curriculum)
     perceptual = _perceptual(settings) if any(phase.gaussians for phase in phases) else None
-    return WholeTask(phases, objective, settings.seed, size, source, settings.real_ratio, perceptual)
+    return FullNetworkTask(phases, objective, settings.seed, size, source, settings.real_ratio, perceptual)
 
 
 def _perceptual(settings: Settings) -> "Perceptual | None":

@@ -18,14 +18,14 @@ from ...model.idesplat.network import IDESplat
 from ...runtime.system.files import make_folder, replacing
 from ..synthetic.sampler import TRAINING_SEEDS
 from .losses import Perceptual, offset_loss, render_loss
-from .scenes import CLOSEST, Order, Views
-from .step import PHOTOMETRIC_SHARE, psnr_of, render_targets, with_input_view
+from .scenes import MAX_TARGET_ZOOM, SampleSpec, Views
+from .step import PHOTOMETRIC_WEIGHT, psnr_of, render_targets, with_input_view
 
 # The parts of the network that are trained: the focused module with what leads into it, and the head.
 HEAD_PARTS = ("conv_image", "fuse", "focus", "expand", "head1", "head2", "cross_view")
 HEAD_PREFIXES = tuple(f"gaussians.{part}." for part in HEAD_PARTS)
 # Context views of the scenes, and the share of the scenes that have so many.
-VIEW_SHARES = {2: 0.75, 3: 0.15, 4: 0.1}
+VIEW_COUNT_PROBABILITIES = {2: 0.75, 3: 0.15, 4: 0.1}
 # A head whose opacities are all near 1 has no gradient left there. Its mean opacity is set to this, and its scales are
 # raised by this factor, which half transparent Gaussians need to leave no gaps.
 SATURATED_OPACITY, START_OPACITY = 0.95, 0.5
@@ -47,7 +47,7 @@ class HeadSample:
 class FeatureCache:
     """Head inputs of scenes, in files that are made when they are first asked for."""
 
-    def __init__(self, folder: Path, model: IDESplat, source: Callable[[Order], Views], description: str) -> None:
+    def __init__(self, folder: Path, model: IDESplat, source: Callable[[SampleSpec], Views], description: str) -> None:
         """Use the subfolder of `folder` that belongs to the frozen weights of `model` and to the `description`.
 
         model: it may be trained meanwhile, but for its frozen part. source: makes a scene's views.
@@ -56,18 +56,18 @@ class FeatureCache:
         self.model, self.source = model, source
         self.folder = make_folder(folder / _digest(model, description))
 
-    def load(self, order: Order) -> HeadSample:
+    def load(self, spec: SampleSpec) -> HeadSample:
         """The sample of an order."""
         torch.set_flush_denormal(True)  # a setting of each thread
-        path = self.folder / f"{order.seed}-{order.context}-{'real' if order.real else 'synthetic'}.pt"
+        path = self.folder / f"{spec.seed}-{spec.context}-{'real' if spec.real else 'synthetic'}.pt"
         if not path.exists():
             with replacing(path) as temporary:
-                torch.save(_packed(self._compute(order)), temporary)
+                torch.save(_packed(self._compute(spec)), temporary)
         return _unpacked(torch.load(path, weights_only=True))
 
     @torch.no_grad()
-    def _compute(self, order: Order) -> HeadSample:
-        views, model = self.source(order), self.model
+    def _compute(self, spec: SampleSpec) -> HeadSample:
+        views, model = self.source(spec), self.model
         cameras = cameras_of(views)
         encoded = model.encoder(views.images, views.extrinsics)
         first = model.dpbu1(encoded, cameras)
@@ -81,13 +81,13 @@ def cameras_of(views: Views) -> Cameras:
     return Cameras(views.extrinsics, views.intrinsics, views.near, views.far)
 
 
-def head_order(seed: int, index: int, height: int, width: int, real_ratio: float) -> Order:
+def head_spec(seed: int, index: int, height: int, width: int, real_ratio: float) -> SampleSpec:
     """The scene of number `index` in the set that a run with `seed` repeats; real_ratio: share of captured scenes."""
     rng = np.random.default_rng((seed, index))
-    context = int(rng.choice(list(VIEW_SHARES), p=list(VIEW_SHARES.values())))
+    context = int(rng.choice(list(VIEW_COUNT_PROBABILITIES), p=list(VIEW_COUNT_PROBABILITIES.values())))
     scene = int(rng.integers(TRAINING_SEEDS.start, TRAINING_SEEDS.stop))
-    closer = (1, int(rng.integers(2, CLOSEST + 1)))
-    return Order(scene, context, closer, height, width, real=bool(rng.random() < real_ratio))
+    target_zooms = (1, int(rng.integers(2, MAX_TARGET_ZOOM + 1)))
+    return SampleSpec(scene, context, target_zooms, height, width, real=bool(rng.random() < real_ratio))
 
 
 def scene_index(seed: int, place: int, scenes: int) -> int:
@@ -108,7 +108,7 @@ def head_loss(
     shown = with_input_view(views, turn % len(views.images))
     rendered = render_targets(predicted.gaussians, shown)
     photometric = render_loss(rendered, shown.target_images, perceptual)
-    loss = PHOTOMETRIC_SHARE * photometric + offset_loss(predicted.raw)
+    loss = PHOTOMETRIC_WEIGHT * photometric + offset_loss(predicted.raw)
     novel, of_input = rendered.detach()[:-1], rendered.detach()[-1:]
     entry = {
         "loss": float(loss.detach()),

@@ -36,7 +36,7 @@ class TrainingLog:
         with self.path.open("a") as file:
             file.write(json.dumps(entry) + "\n")
 
-    def draw_curves(self, path: Path, names: Iterable[str]) -> None:
+    def plot_curves(self, path: Path, names: Iterable[str]) -> None:
         """Write a PNG with one curve below another, for those of `names` that have been logged."""
         curves = {name: [(e["step"], e[name]) for e in self.entries if e.get(name) is not None] for name in names}
         panels = [_curve(name, np.array(points)) for name, points in curves.items() if points]

@@ -14,12 +14,12 @@ from ...model.config import IDESplatConfig
 from ...model.idesplat.dpbu import DPBUOutput
 
 # Shares of the terms of one stage's loss.
-FIRST_LAYER_SHARE = 0.5
-RELATIVE_SHARE = 3.0
-GRADIENT_SHARE = 0.5
-ENTROPY_SHARE = 0.3
-MATCHING_SHARE = 0.5
-MONOCULAR_SHARE = 0.3
+FIRST_LAYER_WEIGHT = 0.5
+RELATIVE_WEIGHT = 3.0
+GRADIENT_WEIGHT = 0.5
+ENTROPY_WEIGHT = 0.3
+MATCHING_WEIGHT = 0.5
+MONOCULAR_WEIGHT = 0.3
 # From here on errors count logarithmically, so that hidden and textureless pixels do not rule: relative to the truth's
 # inverse depth, and in candidates of the coarsest unit.
 LARGE_RELATIVE = 0.5
@@ -28,9 +28,9 @@ LARGE_BINS = 8.0
 LARGE_SQUARED = 0.003
 # The one prior on Gaussians: that they lie in the middle of their pixels. Synthetic views alone teach a head to shift
 # all of them downwards, because floors come nearer downwards and the nearer of two neighbours hides the other.
-OFFSET_SHARE = 0.05
+OFFSET_WEIGHT = 0.05
 # The share of LPIPS beside the squared error (the papers' lambda).
-LPIPS_SHARE = 0.05
+LPIPS_WEIGHT = 0.05
 # The file that torchvision keeps VGG16's weights in, on which LPIPS rests.
 VGG_WEIGHTS = "vgg16-397923af.pth"
 TINY = 1e-6
@@ -50,7 +50,7 @@ def truth_at(inverse_depth: Tensor, height: int, width: int) -> Tensor:
     return inverse_depth[:, rows][:, :, columns][:, None]
 
 
-def coarse_bin(config: IDESplatConfig, near: Tensor, far: Tensor) -> Tensor:
+def candidate_spacing(config: IDESplatConfig, near: Tensor, far: Tensor) -> Tensor:
     """The distance of the coarsest unit's candidates, in inverse scene units, [views, 1, 1, 1]."""
     return ((1 / near - 1 / far) / (config.dpbus[0].candidates - 1))[:, None, None, None]
 
@@ -63,10 +63,10 @@ def inverse_depth_loss(predicted: Tensor, truth: Tensor, bins: Tensor) -> Tensor
     error = (predicted - truth).abs()
     absolute = softened(error / bins, LARGE_BINS)
     relative = softened((predicted.clamp(min=TINY).log() - truth.log()).abs(), LARGE_RELATIVE)
-    loss = absolute.mean() + RELATIVE_SHARE * relative.mean()
+    loss = absolute.mean() + RELATIVE_WEIGHT * relative.mean()
     for axis in (2, 3):
         step = (predicted.diff(dim=axis) - truth.diff(dim=axis)).abs() / bins
-        loss = loss + GRADIENT_SHARE * softened(step, 1.0).mean()
+        loss = loss + GRADIENT_WEIGHT * softened(step, 1.0).mean()
     return loss
 
 
@@ -93,7 +93,7 @@ def entropy_loss(probability: Tensor, candidates: Tensor, truth: Tensor) -> Tens
     return (entropy * inside).sum() / inside.sum().clamp(min=1)
 
 
-def unit_loss(unit: DPBUOutput, scores: tuple[Tensor, Tensor], inverse_depth: Tensor, bins: Tensor) -> Tensor:
+def dpbu_loss(unit: DPBUOutput, scores: tuple[Tensor, Tensor], inverse_depth: Tensor, bins: Tensor) -> Tensor:
     """Everything that one boosting unit is asked.
 
     scores: what its two layers found by matching alone, each [views * neighbours, candidates, h, w]. They are asked
@@ -102,12 +102,12 @@ def unit_loss(unit: DPBUOutput, scores: tuple[Tensor, Tensor], inverse_depth: Te
     """
     truth = truth_at(inverse_depth, *unit.inverse_depth.shape[2:])
     loss = inverse_depth_loss(unit.inverse_depth, truth, bins)
-    loss = loss + ENTROPY_SHARE * entropy_loss(unit.probability, unit.candidates, truth)
-    loss = loss + FIRST_LAYER_SHARE * inverse_depth_loss(unit.inverse_depth_first, truth, bins)
+    loss = loss + ENTROPY_WEIGHT * entropy_loss(unit.probability, unit.candidates, truth)
+    loss = loss + FIRST_LAYER_WEIGHT * inverse_depth_loss(unit.inverse_depth_first, truth, bins)
     neighbours = scores[0].shape[0] // truth.shape[0]
     candidates, truth = repeat_views(unit.candidates, neighbours), repeat_views(truth, neighbours)
     for layer in scores:
-        loss = loss + MATCHING_SHARE * entropy_loss(layer.softmax(1), candidates, truth)
+        loss = loss + MATCHING_WEIGHT * entropy_loss(layer.softmax(1), candidates, truth)
     return loss
 
 
@@ -116,7 +116,7 @@ def monocular_loss(encoded: EncoderFeatures, inverse_depth: Tensor) -> Tensor:
     disparity = encoded.mono_disparity
     truth = truth_at(inverse_depth, *disparity.shape[2:])
     error = (disparity / disparity.mean().clamp(min=TINY) - truth / truth.mean()).abs()
-    return MONOCULAR_SHARE * softened(error, 1.0).mean()
+    return MONOCULAR_WEIGHT * softened(error, 1.0).mean()
 
 
 def render_loss(rendered: Tensor, truth: Tensor, perceptual: Perceptual | None) -> Tensor:
@@ -126,7 +126,7 @@ def render_loss(rendered: Tensor, truth: Tensor, perceptual: Perceptual | None) 
     """
     squared = (rendered - truth).square().mean((1, 2, 3))
     loss = softened(squared, LARGE_SQUARED).mean()
-    return loss if perceptual is None else loss + LPIPS_SHARE * perceptual(rendered, truth)
+    return loss if perceptual is None else loss + LPIPS_WEIGHT * perceptual(rendered, truth)
 
 
 def offset_loss(raw: Tensor) -> Tensor:
@@ -134,7 +134,7 @@ def offset_loss(raw: Tensor) -> Tensor:
 
     raw: what GaussianAdapter is given, [views, parameters, H, W].
     """
-    return OFFSET_SHARE * (raw[:, BASE_OFFSETS].sigmoid() - 0.5).abs().mean()
+    return OFFSET_WEIGHT * (raw[:, BASE_OFFSETS].sigmoid() - 0.5).abs().mean()
 
 
 def load_perceptual() -> Perceptual | None:

@@ -37,7 +37,7 @@ class Team:
         """The places in a batch whose scenes are this process's."""
         return range(self.rank, batch, self.size)
 
-    def sum_gradients(self, parameters: Iterable[nn.Parameter]) -> None:
+    def all_reduce_gradients(self, parameters: Iterable[nn.Parameter]) -> None:
         """Replace every gradient by its sum over all processes; raises InputError if one of them has ended.
 
         A parameter that no process has a gradient for keeps none.
@@ -65,7 +65,7 @@ class Team:
 
 
 @contextmanager
-def other_processes(size: int, work: Callable[..., None], *arguments: Any) -> Iterator[None]:
+def spawn_workers(size: int, work: Callable[..., None], *arguments: Any) -> Iterator[None]:
     """Start the other processes of a team of `size`, of which this one is rank 0; each runs `work(team, *arguments)`.
 
     work: a function of a module, since the processes are new ones. They end with this process, however it ends.

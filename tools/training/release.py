@@ -1,8 +1,8 @@
-"""Make a trained checkpoint the model that is carried along.
+"""Make a trained checkpoint the bundled model.
 
     python -P -m idesplat.tools.training.release runs/tiny/last.ckpt
 
-Exports it, verified, to `runtime/default/`, and writes its checksum beside it.
+Exports it, verified, to `runtime/inference/bundled/`, and writes its checksum beside it.
 """
 
 import hashlib
@@ -21,11 +21,11 @@ PRESET = "idesplat-tiny"
 
 
 @exit_on_input_error
-def carry(
+def release_bundled_model(
     checkpoint: Annotated[Path, typer.Argument(help="What idesplat-train wrote.", show_default=False)],
     preset: Annotated[str, typer.Option(help="The network.")] = PRESET,
 ) -> None:
-    """Export a checkpoint as the carried model."""
+    """Export a checkpoint as the bundled model."""
     path = make_folder(FOLDER) / NAME
     export(checkpoint, path, preset=preset)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
@@ -35,7 +35,7 @@ def carry(
 
 def main() -> None:
     """Run the command."""
-    run(carry)
+    run(release_bundled_model)
 
 
 if __name__ == "__main__":

@@ -13,14 +13,14 @@ import torch
 from torch import Tensor
 
 from ..synthetic.photo_textures import joined, photo_textures
-from ..synthetic.sampler import TRAINING_SEEDS, Sample, draw_sample, scene_textures
+from ..synthetic.sampler import TRAINING_SEEDS, Sample, generate_sample, scene_textures
 from ..synthetic.textures import Textures
 
 # Share of the scenes with three context views instead of two.
-THREE_VIEW_SHARE = 0.06
+THREE_VIEW_PROBABILITY = 0.06
 # Novel views are asked for as large as the photographs and, each step, a window of one up to so many times as large:
 # splats that only meet views of their own size leave gaps when a viewer fills a screen with them.
-CLOSEST = 4
+MAX_TARGET_ZOOM = 4
 # Scenes drawn ahead of their use.
 AHEAD = 4
 
@@ -43,16 +43,16 @@ class Views:
 
 
 @dataclass(frozen=True)
-class Order:
+class SampleSpec:
     """One scene as a step wants it.
 
-    closer: for each target how many times as large as the context it is drawn, a window of it.
+    target_zooms: each target is a random crop of an image that many times as large as the context images.
     real: whether the views are those of a capture, where a run has both kinds.
     """
 
     seed: int
     context: int
-    closer: tuple[int, ...]
+    target_zooms: tuple[int, ...]
     height: int
     width: int
     real: bool = False
@@ -77,14 +77,16 @@ def to_views(sample: Sample) -> Views:
     )
 
 
-def draw_views(order: Order, photos: Path | None = None) -> Views:
+def generate_views(spec: SampleSpec, photos: Path | None = None) -> Views:
     """The scene of an order; the same order gives the same scene.
 
     photos: a folder of images for the textures of training scenes, beside the generated ones.
     """
-    bank = _with_photos(photos) if photos is not None and order.seed in TRAINING_SEEDS else None
-    size = order.height, order.width
-    return to_views(draw_sample(order.seed, order.context, len(order.closer), *size, closer=order.closer, bank=bank))
+    bank = _with_photos(photos) if photos is not None and spec.seed in TRAINING_SEEDS else None
+    zooms = spec.target_zooms
+    return to_views(
+        generate_sample(spec.seed, spec.context, len(zooms), spec.height, spec.width, target_zooms=zooms, bank=bank)
+    )
 
 
 @cache
@@ -93,28 +95,28 @@ def _with_photos(folder: Path) -> Textures:
     return joined(scene_textures(TRAINING_SEEDS.start), photo_textures(folder))
 
 
-def training_order(
+def training_spec(
     seed: int, step: int, slot: int, rendered: bool, height: int, width: int, many: bool, real_ratio: float = 0.0
-) -> Order:
+) -> SampleSpec:
     """The scene at place `slot` of a step's batch, drawn from the run's seed and the step alone.
 
     rendered: whether it has novel views. many: whether some scenes are to have three context views.
     real_ratio: share of the scenes that are captures.
     """
     rng = np.random.default_rng((seed, step, slot))
-    context = 3 if many and rng.random() < THREE_VIEW_SHARE else 2
+    context = 3 if many and rng.random() < THREE_VIEW_PROBABILITY else 2
     scene = int(rng.integers(TRAINING_SEEDS.start, TRAINING_SEEDS.stop))
-    closer = (1, int(rng.integers(2, CLOSEST + 1))) if rendered else ()
-    return Order(scene, context, closer, height, width, real=bool(rng.random() < real_ratio))
+    target_zooms = (1, int(rng.integers(2, MAX_TARGET_ZOOM + 1))) if rendered else ()
+    return SampleSpec(scene, context, target_zooms, height, width, real=bool(rng.random() < real_ratio))
 
 
-def drawn_ahead(orders: Iterator[Order], draw: Callable[[Order], T]) -> Generator[T]:
-    """The scenes of `orders`, in that order, drawn by a thread while the caller is at work."""
+def prefetch(specs: Iterator[SampleSpec], load: Callable[[SampleSpec], T]) -> Generator[T]:
+    """The scenes of `specs`, in that order, drawn by a thread while the caller is at work."""
     with ThreadPoolExecutor(1, thread_name_prefix="scenes") as pool:
         waiting: deque[Future[T]] = deque()
         try:
-            for order in orders:
-                waiting.append(pool.submit(draw, order))
+            for spec in specs:
+                waiting.append(pool.submit(load, spec))
                 if len(waiting) > AHEAD:
                     yield waiting.popleft().result()
             while waiting:

@@ -58,7 +58,7 @@ class Phase:
 
 # The coarse unit learns what it can at half the size in some 2500 steps. The rest is learned at the full size, where a
 # pixel's disparity is twice as large, and where splats have the size in scene units that they will be used with.
-GRADUAL = (
+CURRICULUM = (
     Phase(0.57, units=1, gaussians=False, shrink=2),
     Phase(0.64, units=2, gaussians=False, shrink=2, effort=2.0),
     Phase(0.74, units=3, gaussians=False, shrink=2, effort=3.0),
@@ -67,12 +67,12 @@ GRADUAL = (
 )
 
 
-def curriculum(objective: Objective, gradual: bool) -> tuple[Phase, ...]:
+def training_phases(objective: Objective, curriculum: bool) -> tuple[Phase, ...]:
     """The phases of a run; without true depth in the objective there is nothing to train the coarse part on alone."""
     rendered = objective is not Objective.DEPTH
-    if not gradual or objective is Objective.PHOTOMETRIC:
+    if not curriculum or objective is Objective.PHOTOMETRIC:
         return (Phase(1.0, units=3, gaussians=rendered, shrink=1),)
-    return tuple(replace(phase, gaussians=phase.gaussians and rendered) for phase in GRADUAL)
+    return tuple(replace(phase, gaussians=phase.gaussians and rendered) for phase in CURRICULUM)
 
 
 def phase_at(phases: tuple[Phase, ...], step: int, steps: int) -> Phase:
@@ -80,7 +80,7 @@ def phase_at(phases: tuple[Phase, ...], step: int, steps: int) -> Phase:
     return next((phase for phase in phases if step < phase.until * steps), phases[-1])
 
 
-def rate_at(phases: tuple[Phase, ...], step: int, steps: int) -> float:
+def lr_factor(phases: tuple[Phase, ...], step: int, steps: int) -> float:
     """The share of the highest learning rate at a step, counted from 0: a linear warm-up, then a cosine.
 
     The cosine goes by the effort spent, not by steps, so that the last and largest steps still teach.

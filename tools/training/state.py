@@ -17,14 +17,16 @@ from .gather_attention import with_compiled_products
 from .initialization import new_model
 
 # The running mean forgets at this rate, and faster in the beginning.
-MEAN_DECAY = 0.99
-MEAN_START = 10
+EMA_DECAY = 0.99
+EMA_START = 10
 WEIGHT_DECAY = 0.01
 LARGEST_GRADIENT = 1.0
 # The optimiser's groups, in this order.
 BACKBONE_PREFIX = "encoder.vit."
 # Weights that were trained on photographs elsewhere, and stay as they are.
 FROZEN_PREFIX = "encoder.photo.network."
+# Settings that earlier versions wrote under another name.
+RENAMED_SETTINGS = {"gradual": "curriculum"}
 # A part that older checkpoints lack. As it is made, it changes nothing.
 OPTIONAL_PREFIX = "gaussians.cross_view."
 
@@ -40,7 +42,7 @@ class TrainingState:
         trained: the beginnings of the names of the parameters that are trained; all others are frozen.
         """
         self.model = with_compiled_products(new_model(config, seed))
-        self.mean = {name: value.clone() for name, value in self.model.state_dict().items()}
+        self.ema = {name: value.clone() for name, value in self.model.state_dict().items()}
         self.step = 0
         for name, parameter in self.model.named_parameters():
             parameter.requires_grad_(name.startswith(trained) and not name.startswith(FROZEN_PREFIX))
@@ -60,39 +62,39 @@ class TrainingState:
             fill(self.model, {name: made[name] for name in made if name.startswith(OPTIONAL_PREFIX)} | tensors, path)
         except CheckpointError as error:
             raise InputError(str(error)) from None
-        self.reset_mean()
+        self.reset_ema()
 
-    def reset_mean(self) -> None:
+    def reset_ema(self) -> None:
         """Start the running mean anew, with the weights as they are."""
-        self.mean = {name: value.clone() for name, value in self.model.state_dict().items()}
+        self.ema = {name: value.clone() for name, value in self.model.state_dict().items()}
 
-    def update(self, rate: float) -> float:
-        """Step along the gradients gathered, at `rate` times the highest learning rates; returns the gradient's norm.
+    def update(self, lr_factor: float) -> float:
+        """Make an optimiser step at `lr_factor` times the highest learning rates; returns the gradient's norm.
 
         A step whose gradient is not finite leaves the weights as they are.
         """
         for group in self.optimizer.param_groups:
-            group["lr"] = rate * group["highest"]
+            group["lr"] = lr_factor * group["highest"]
         norm = float(nn.utils.clip_grad_norm_(self.model.parameters(), LARGEST_GRADIENT))
         if math.isfinite(norm):
             self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         self.step += 1
-        decay = min(MEAN_DECAY, self.step / (self.step + MEAN_START))
+        decay = min(EMA_DECAY, self.step / (self.step + EMA_START))
         weights = self.model.state_dict()
-        get_ema_multi_avg_fn(decay)(list(self.mean.values()), [weights[name] for name in self.mean], None)
+        get_ema_multi_avg_fn(decay)(list(self.ema.values()), [weights[name] for name in self.ema], None)
         return norm
 
-    def mean_model(self) -> IDESplat:
+    def ema_model(self) -> IDESplat:
         """The network with the running mean of the weights, which predicts better than the last weights."""
         model = with_compiled_products(IDESplat(self.model.config).eval())
-        model.load_state_dict(self.mean)
+        model.load_state_dict(self.ema)
         return model
 
     def save(self, path: Path, settings: dict[str, Any]) -> None:
         """Write a checkpoint whose `state_dict` is the mean, as the exporter reads it, beside what resuming needs."""
         content = {
-            "state_dict": self.mean,
+            "state_dict": self.ema,
             "training": {
                 "weights": self.model.state_dict(),
                 "optimizer": self.optimizer.state_dict(),
@@ -112,7 +114,7 @@ class TrainingState:
         except Exception as error:  # torch raises whatever it meets inside of a file that is not a checkpoint
             reason = (str(error).splitlines() or [type(error).__name__])[0]
             raise InputError(f"{path}: not a checkpoint of a training run ({reason}); choose another --out") from None
-        before = training["settings"]
+        before = {RENAMED_SETTINGS.get(name, name): value for name, value in training["settings"].items()}
         changed = [
             f"{name} was {before.get(name)}, not {settings[name]}"
             for name in settings
@@ -125,5 +127,5 @@ class TrainingState:
             )
         self.model.load_state_dict(training["weights"])
         self.optimizer.load_state_dict(training["optimizer"])
-        self.mean = content["state_dict"]
+        self.ema = content["state_dict"]
         self.step = training["step"]

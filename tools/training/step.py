@@ -12,18 +12,26 @@ from ...model.common.geometry import invert_rigid, scale_intrinsics
 from ...model.common.layers import resize
 from ...model.idesplat.dpbu import Cameras, DPBUOutput
 from ...model.idesplat.network import IDESplat
-from .losses import Perceptual, coarse_bin, inverse_depth_loss, monocular_loss, offset_loss, render_loss, unit_loss
+from .losses import (
+    Perceptual,
+    candidate_spacing,
+    dpbu_loss,
+    inverse_depth_loss,
+    monocular_loss,
+    offset_loss,
+    render_loss,
+)
 from .rasterizer import rasterize
 from .scenes import Views
 from .schedule import Objective, Phase
 
 # Squared errors of colours are small beside errors of depth counted in candidates.
-PHOTOMETRIC_SHARE = 10.0
+PHOTOMETRIC_WEIGHT = 10.0
 WITHIN = 0.05
 
 
 @dataclass(frozen=True)
-class Outcome:
+class PhaseOutput:
     """What the parts that ran say of a scene."""
 
     encoded: EncoderFeatures
@@ -35,23 +43,23 @@ class Outcome:
     rendered: Tensor | None = None
 
 
-def run_phase(model: IDESplat, views: Views, phase: Phase) -> Outcome:
+def run_phase(model: IDESplat, views: Views, phase: Phase) -> PhaseOutput:
     """Run the encoder and as many units as the phase has; with three also the depth fusion and, if asked, all else."""
     cameras = Cameras(views.extrinsics, views.intrinsics, views.near, views.far)
     encoded = model.encoder(views.images, views.extrinsics)
     first = model.dpbu1(encoded, cameras)
     if phase.units == 1:
-        return Outcome(encoded, (first,), first.inverse_depth)
+        return PhaseOutput(encoded, (first,), first.inverse_depth)
     second = model.dpbu2(encoded, first, cameras)
     if phase.units == 2:
-        return Outcome(encoded, (first, second), second.inverse_depth)
+        return PhaseOutput(encoded, (first, second), second.inverse_depth)
     units = (first, second, model.dpbu3(encoded, second, cameras))
     if not phase.gaussians:
         fused = model.gaussians.fused_inverse_depth(units, cameras, *views.images.shape[2:])
-        return Outcome(encoded, units, fused)
+        return PhaseOutput(encoded, units, fused)
     predicted = model.gaussians(views.images, cameras, encoded, units)
     rendered = render_targets(predicted.gaussians, views)
-    return Outcome(encoded, units, 1 / predicted.depth[:, None], predicted.raw, rendered)
+    return PhaseOutput(encoded, units, 1 / predicted.depth[:, None], predicted.raw, rendered)
 
 
 def render_targets(gaussians: tuple[Tensor, ...], views: Views) -> Tensor:
@@ -108,22 +116,22 @@ def scene_loss(
     loss = torch.zeros(())
     entry = measures(outcome, views)
     if objective is not Objective.PHOTOMETRIC and views.inverse_depth is not None:
-        bins = coarse_bin(model.config, views.near, views.far)
+        bins = candidate_spacing(model.config, views.near, views.far)
         loss = loss + monocular_loss(outcome.encoded, views.inverse_depth)
         for index, unit in enumerate(outcome.units):
             of_layers = scores[2 * index], scores[2 * index + 1]
-            loss = loss + unit_loss(unit, of_layers, views.inverse_depth, bins)
+            loss = loss + dpbu_loss(unit, of_layers, views.inverse_depth, bins)
         if phase.units == 3:
             loss = loss + inverse_depth_loss(outcome.inverse_depth, views.inverse_depth[:, None], bins)
     if outcome.raw is not None:
         loss = loss + offset_loss(outcome.raw)
     if outcome.rendered is not None:
-        loss = loss + PHOTOMETRIC_SHARE * render_loss(outcome.rendered, views.target_images, perceptual)
+        loss = loss + PHOTOMETRIC_WEIGHT * render_loss(outcome.rendered, views.target_images, perceptual)
     return loss, {"loss": float(loss.detach()), **entry}
 
 
 @torch.no_grad()
-def measures(outcome: Outcome, views: Views) -> dict[str, float]:
+def measures(outcome: PhaseOutput, views: Views) -> dict[str, float]:
     """AbsRel (mean of |D / D* - 1|) and the share of pixels within 5 % at the size of the images; PSNR of novel views.
 
     Pixels that only one view sees are counted too. Photographs have no true depth.

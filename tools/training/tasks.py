@@ -13,16 +13,16 @@ from .head import (
     FeatureCache,
     HeadSample,
     head_loss,
-    head_order,
+    head_spec,
     reset_opacity,
     scene_index,
 )
 from .losses import Perceptual
-from .scenes import Order, Views, training_order
-from .schedule import Objective, Phase, curriculum
+from .scenes import SampleSpec, Views, training_spec
+from .schedule import Objective, Phase, training_phases
 from .step import scene_loss
 
-Source = Callable[[Order], Views]
+Source = Callable[[SampleSpec], Views]
 Sample = TypeVar("Sample")
 Losses = tuple[Tensor, dict[str, float]]
 
@@ -35,11 +35,11 @@ class TrainingTask(ABC, Generic[Sample]):
     phases: tuple[Phase, ...]
 
     @abstractmethod
-    def order(self, step: int, slot: int, phase: Phase) -> Order:
+    def spec(self, step: int, slot: int, phase: Phase) -> SampleSpec:
         """The scene at place `slot` of a step's batch."""
 
     @abstractmethod
-    def load(self, order: Order) -> Sample:
+    def load(self, spec: SampleSpec) -> Sample:
         """The scene of an order; it runs beside `loss`, in another thread."""
 
     @abstractmethod
@@ -50,7 +50,7 @@ class TrainingTask(ABC, Generic[Sample]):
         """Change the weights that a new run starts from."""
 
 
-class WholeTask(TrainingTask[Views]):
+class FullNetworkTask(TrainingTask[Views]):
     """All of the network, in phases."""
 
     def __init__(
@@ -67,15 +67,15 @@ class WholeTask(TrainingTask[Views]):
         self.phases, self.objective, self.perceptual = phases, objective, perceptual
         self.seed, self.size, self.source, self.real_ratio = seed, size, source, real_ratio
 
-    def order(self, step: int, slot: int, phase: Phase) -> Order:
-        """As `training_order`; captures only where novel views are rendered, since they have no true depth."""
+    def spec(self, step: int, slot: int, phase: Phase) -> SampleSpec:
+        """As `training_spec`; captures only where novel views are rendered, since they have no true depth."""
         side = self.size // phase.shrink
         ratio = self.real_ratio if phase.gaussians else 0.0
-        return training_order(self.seed, step, slot, phase.gaussians, side, side, phase.units > 1, ratio)
+        return training_spec(self.seed, step, slot, phase.gaussians, side, side, phase.units > 1, ratio)
 
-    def load(self, order: Order) -> Views:
+    def load(self, spec: SampleSpec) -> Views:
         """The scene's views."""
-        return self.source(order)
+        return self.source(spec)
 
     def loss(self, model: IDESplat, sample: Views, step: int, phase: Phase) -> Losses:
         """As `scene_loss`."""
@@ -86,7 +86,7 @@ class HeadTask(TrainingTask[HeadSample]):
     """The Gaussian head alone, on a set of scenes that is repeated."""
 
     trained = HEAD_PREFIXES
-    phases = curriculum(Objective.PHOTOMETRIC, gradual=False)
+    phases = training_phases(Objective.PHOTOMETRIC, curriculum=False)
 
     def __init__(
         self,
@@ -102,14 +102,14 @@ class HeadTask(TrainingTask[HeadSample]):
         self.cache, self.perceptual = cache, perceptual
         self.seed, self.size, self.batch, self.scenes, self.real_ratio = seed, size, batch, scenes, real_ratio
 
-    def order(self, step: int, slot: int, phase: Phase) -> Order:
+    def spec(self, step: int, slot: int, phase: Phase) -> SampleSpec:
         """Every scene once an epoch."""
         index = scene_index(self.seed, step * self.batch + slot, self.scenes)
-        return head_order(self.seed, index, self.size, self.size, self.real_ratio)
+        return head_spec(self.seed, index, self.size, self.size, self.real_ratio)
 
-    def load(self, order: Order) -> HeadSample:
+    def load(self, spec: SampleSpec) -> HeadSample:
         """The scene's cached features."""
-        return self.cache.load(order)
+        return self.cache.load(spec)
 
     def loss(self, model: IDESplat, sample: HeadSample, step: int, phase: Phase) -> Losses:
         """As `head_loss`."""
@@ -117,4 +117,4 @@ class HeadTask(TrainingTask[HeadSample]):
 
     def prepare(self, model: IDESplat) -> None:
         """Reset saturated opacities."""
-        reset_opacity(model, (self.load(self.order(step, 0, self.phases[0])) for step in range(RESET_SCENES)))
+        reset_opacity(model, (self.load(self.spec(step, 0, self.phases[0])) for step in range(RESET_SCENES)))

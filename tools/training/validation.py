@@ -10,9 +10,9 @@ from ...model.common.layers import resize
 from ...model.idesplat.network import IDESplat
 from ..synthetic.sampler import VALIDATION_SEEDS
 from .log import picture, strip, write_rows
-from .scenes import Order, Views
+from .scenes import SampleSpec, Views
 from .schedule import Phase
-from .step import Outcome, measures, run_phase
+from .step import PhaseOutput, measures, run_phase
 
 SCENES = 8
 PICTURED = 4
@@ -20,13 +20,13 @@ PICTURED = 4
 
 @torch.no_grad()
 def validate(
-    model: IDESplat, phase: Phase, side: int, draw: Callable[[Order], Views], pictures: Path
+    model: IDESplat, phase: Phase, side: int, load: Callable[[SampleSpec], Views], pictures: Path
 ) -> dict[str, float]:
     """The mean measures of the first validation scenes, of two context views of `side` pixels; writes `pictures`."""
     entries: list[dict[str, float]] = []
     rows: list[np.ndarray] = []
     for seed in VALIDATION_SEEDS[:SCENES]:
-        views = draw(Order(seed, 2, (1,) * phase.gaussians, side, side))
+        views = load(SampleSpec(seed, 2, (1,) * phase.gaussians, side, side))
         outcome = run_phase(model, views, phase)
         entries.append(measures(outcome, views))
         if len(rows) < PICTURED:
@@ -35,7 +35,7 @@ def validate(
     return {f"validation_{name}": sum(entry[name] for entry in entries) / SCENES for name in entries[0]}
 
 
-def _row(views: Views, outcome: Outcome) -> np.ndarray:
+def _row(views: Views, outcome: PhaseOutput) -> np.ndarray:
     """Photograph, truth, prediction and error of the first view, then the first novel view and its rendering."""
     predicted = resize(outcome.inverse_depth, *views.images.shape[2:])[0, 0]
     truth = None if views.inverse_depth is None else views.inverse_depth[0].numpy()

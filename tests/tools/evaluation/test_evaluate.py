@@ -23,7 +23,7 @@ from idesplat.tools.evaluation.cases import procedural_case
 from idesplat.tools.evaluation.chunks import IndexEntry, chunk_cases
 from idesplat.tools.evaluation.cli import main
 from idesplat.tools.evaluation.image_folders import load_case
-from idesplat.tools.synthetic.sampler import HELD_OUT_SEEDS, draw_sample
+from idesplat.tools.synthetic.sampler import HELD_OUT_SEEDS, generate_sample
 from skimage.metrics import structural_similarity
 from test_chunks import as_scene
 
@@ -166,7 +166,7 @@ def test_procedural_scenes_have_true_depth(workplace: Path, opened: Predictor, c
     content = results()
     (only,) = content["scenes"]
     assert only["name"] == str(HELD_OUT_SEEDS[0]) and len(only["context"]) == 3
-    sample = draw_sample(HELD_OUT_SEEDS[0], 3, evaluate.TARGETS, 64, 96)
+    sample = generate_sample(HELD_OUT_SEEDS[0], 3, evaluate.TARGETS, 64, 96)
     prediction = opened.predict_arrays(
         sample.images[:3], sample.extrinsics[:3], sample.intrinsics[:3], sample.near, sample.far
     )

@@ -10,7 +10,7 @@ from idesplat.tools.synthetic.layout import LAYOUTS, OUTDOOR_LAYOUTS, Builder
 from idesplat.tools.synthetic.photo_textures import KIND, photo_textures
 from idesplat.tools.synthetic.sampler import TRAINING_SEEDS, VALIDATION_SEEDS
 from idesplat.tools.synthetic.textures import SIZE, texture_bank
-from idesplat.tools.training.scenes import Order, draw_views
+from idesplat.tools.training.scenes import SampleSpec, generate_views
 
 
 @pytest.fixture(scope="module")
@@ -51,9 +51,9 @@ def test_materials_have_them_where_they_are(folder: Path) -> None:
 
 
 def test_training_scenes_change_and_reported_ones_do_not(folder: Path) -> None:
-    training, reported = (Order(seeds[5], 2, (1,), 32, 32) for seeds in (TRAINING_SEEDS, VALIDATION_SEEDS))
-    assert (draw_views(training).images != draw_views(training, folder).images).any()
-    assert (draw_views(reported).images == draw_views(reported, folder).images).all()
+    training, reported = (SampleSpec(seeds[5], 2, (1,), 32, 32) for seeds in (TRAINING_SEEDS, VALIDATION_SEEDS))
+    assert (generate_views(training).images != generate_views(training, folder).images).any()
+    assert (generate_views(reported).images == generate_views(reported, folder).images).all()
 
 
 @pytest.mark.parametrize("kind", range(len(OUTDOOR_LAYOUTS)))

@@ -11,9 +11,9 @@ from idesplat.tools.synthetic.sampler import (
     TRAINING_SEEDS,
     VALIDATION_SEEDS,
     Sample,
-    draw_sample,
+    generate_sample,
     look_at,
-    photograph,
+    render,
     scene_textures,
 )
 from idesplat.tools.synthetic.textures import LEVELS, SIZE, Textures, texture_bank
@@ -62,7 +62,7 @@ WIDE_ANGLE = np.array([[0.7, 0, 0.48], [0, 0.9, 0.53], [0, 0, 1]])
 
 def test_depth_of_walls_is_analytic() -> None:
     pose = look_at(np.array([1.0, -2.0, -3.0]), np.array([4.0, 1.0, 5.0]), roll=0.3)
-    _, depth = photograph(scene_of(), GREY, pose, WIDE_ANGLE, 40, 56, 0)
+    _, depth = render(scene_of(), GREY, pose, WIDE_ANGLE, 40, 56, 0)
     rays = pixel_rays(WIDE_ANGLE, 40, 56) @ pose[:3, :3].T
     to_walls = np.where(rays > 0, 10 - pose[:3, 3], -10 - pose[:3, 3]) / rays
     np.testing.assert_allclose(depth, to_walls.min(axis=-1), rtol=1e-6)
@@ -79,11 +79,11 @@ def test_depth_of_solids_is_analytic() -> None:
     }
     for (shape, degrees), expected in fronts.items():
         scene = scene_of((shape, (0.0, 0.0, 4.0), (1.5, 0.8, 0.5), turned(degrees)))
-        _, depth = photograph(scene, GREY, np.eye(4), straight, 33, 33, 0)
+        _, depth = render(scene, GREY, np.eye(4), straight, 33, 33, 0)
         assert depth[16, 16] == pytest.approx(expected, rel=1e-6), (shape, degrees)
     # A card that faces the camera has one z-depth all over.
     card = scene_of((BOX, (0.0, 0.0, 4.0), (1.0, 1.0, 0.01), np.eye(3)))
-    _, depth = photograph(card, GREY, np.eye(4), straight, 64, 64, 0)
+    _, depth = render(card, GREY, np.eye(4), straight, 64, 64, 0)
     np.testing.assert_allclose(depth[20:44, 20:44], 3.99, rtol=1e-6)
     assert (depth == np.float32(3.99)).mean() == pytest.approx((2 / 3.99) ** 2, rel=0.05)
 
@@ -92,8 +92,8 @@ def test_lamp_casts_a_shadow_below_a_solid() -> None:
     above = look_at(np.array([0.0, 0.0, -8.0]), np.array([0.0, 9.0, 0.0]))
     square = np.array([[1.0, 0, 0.5], [0, 1.0, 0.5], [0, 0, 1]])
     ball = scene_of((ELLIPSOID, (0.0, -4.0, 0.0), (2.0, 1.0, 2.0), np.eye(3)))
-    with_ball, depth = photograph(ball, GREY, above, square, 48, 48, 4)
-    without, empty_depth = photograph(scene_of(), GREY, above, square, 48, 48, 4)
+    with_ball, depth = render(ball, GREY, above, square, 48, 48, 4)
+    without, empty_depth = render(scene_of(), GREY, above, square, 48, 48, 4)
     shaded = (with_ball < 0.8 * without).all(axis=-1) & (depth == empty_depth)
     points = pixel_rays(square, 48, 48) * depth[..., None] @ above[:3, :3].T + above[:3, 3]
     on_floor = points[..., 1] > 9.999
@@ -105,28 +105,28 @@ def test_lamp_casts_a_shadow_below_a_solid() -> None:
 
 
 def test_same_seed_same_sample_other_seed_another() -> None:
-    first, again, other = (draw_sample(seed, 2, 1, 32, 48) for seed in (7, 7, 8))
+    first, again, other = (generate_sample(seed, 2, 1, 32, 48) for seed in (7, 7, 8))
     for name in ("images", "depth", "extrinsics", "intrinsics", "near", "far"):
         np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
     assert np.abs(first.images - other.images).mean() > 0.05
     assert np.abs(first.intrinsics - other.intrinsics).max() > 0.01
 
 
-def test_target_drawn_closer_is_a_window_of_the_larger_picture() -> None:
+def test_zoomed_target_is_a_crop_of_the_larger_image() -> None:
     """Context and cameras stay; every pixel of the window shows what the large picture shows there."""
-    plain, closer = (draw_sample(7, 2, 2, 64, 96, closer=times) for times in ((), (1, 3)))
-    large = draw_sample(7, 2, 2, 3 * 64, 3 * 96)
-    assert np.array_equal(plain.extrinsics[:, :3, :3], closer.extrinsics[:, :3, :3])
-    assert np.array_equal(plain.intrinsics[:3], closer.intrinsics[:3])
-    corner = 3 * plain.intrinsics[3, :2, 2] - closer.intrinsics[3, :2, 2]  # in windows
+    plain, zoomed = (generate_sample(7, 2, 2, 64, 96, target_zooms=times) for times in ((), (1, 3)))
+    large = generate_sample(7, 2, 2, 3 * 64, 3 * 96)
+    assert np.array_equal(plain.extrinsics[:, :3, :3], zoomed.extrinsics[:, :3, :3])
+    assert np.array_equal(plain.intrinsics[:3], zoomed.intrinsics[:3])
+    corner = 3 * plain.intrinsics[3, :2, 2] - zoomed.intrinsics[3, :2, 2]  # in windows
     assert (corner >= 0).all() and (corner <= 2).all() and corner.max() > 0
     left, top = (corner * (96, 64)).round().astype(int)
     shown = large.depth[3, top : top + 64, left : left + 96] / large.depth[0].min()
-    assert np.median(np.abs(closer.depth[3] / closer.depth[0].min() / shown - 1)) < 0.01
+    assert np.median(np.abs(zoomed.depth[3] / zoomed.depth[0].min() / shown - 1)) < 0.01
 
 
 def test_samples_are_well_formed() -> None:
-    samples = [draw_sample(seed, 2, 2, 24, 32) for seed in (*range(60), *HELD_OUT_SEEDS[:4])]
+    samples = [generate_sample(seed, 2, 2, 24, 32) for seed in (*range(60), *HELD_OUT_SEEDS[:4])]
     for sample in samples:
         assert sample.images.shape == (4, 3, 24, 32) and sample.depth.shape == (4, 24, 32)
         assert all(part.dtype == np.float32 for part in (sample.images, sample.depth, sample.extrinsics))
@@ -165,7 +165,7 @@ def warped(sample: Sample, source: int, target: int) -> tuple[np.ndarray, np.nda
 @pytest.mark.parametrize("seed", [1, 2, 3, 4, 5, 6])
 def test_views_agree_where_depth_says_so(seed: int) -> None:
     """A pixel moved by its depth meets the other view's depth and colour, or is hidden there, but floats nowhere."""
-    sample = draw_sample(seed, 1, 2, 96, 96)
+    sample = generate_sample(seed, 1, 2, 96, 96)
     places, z, colours, inside = warped(sample, 1, 2)
     assert inside.mean() > 0.3
     column, row = places.astype(int).T
@@ -192,7 +192,7 @@ def test_more_samples_come_closer_to_the_true_colour() -> None:
     rng = np.random.default_rng(0)
     layout = furnished_room(rng, bank)
     pose = look_at(layout.eyes.mean(axis=0), layout.focus[1])
-    one, four, many = (photograph(layout.scene, bank, pose, WIDE_ANGLE, 64, 64, count)[0] for count in (1, 4, 64))
+    one, four, many = (render(layout.scene, bank, pose, WIDE_ANGLE, 64, 64, count)[0] for count in (1, 4, 64))
     error_of_one, error_of_four = (np.sqrt(np.mean((image - many) ** 2)) for image in (one, four))
     assert error_of_four < 0.75 * error_of_one
     assert error_of_four < 0.03

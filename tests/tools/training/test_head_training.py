@@ -18,23 +18,23 @@ from idesplat.tools.training.head import (
     FeatureCache,
     HeadSample,
     head_loss,
-    head_order,
+    head_spec,
     reset_opacity,
     scene_index,
 )
 from idesplat.tools.training.initialization import new_model
-from idesplat.tools.training.scenes import Order, Views, draw_views
+from idesplat.tools.training.scenes import SampleSpec, Views, generate_views
 from idesplat.tools.training.schedule import Part
 from test_train import SETTINGS, SMALL, finished, logged, one_thread, refused
 
 __all__ = ["finished", "one_thread"]  # fixtures
 CONFIG = replace(SMALL, cross_view_channels=4, scale_in_pixels=True)
-HEAD = replace(SETTINGS, gradual=False, steps=4, batch=1, part="head", scenes=3)
+HEAD = replace(SETTINGS, curriculum=False, steps=4, batch=1, part="head", scenes=3)
 
 
 @pytest.fixture
 def cache(tmp_path: Path) -> FeatureCache:
-    return FeatureCache(tmp_path / "cache", new_model(CONFIG, seed=0), draw_views, "test")
+    return FeatureCache(tmp_path / "cache", new_model(CONFIG, seed=0), generate_views, "test")
 
 
 def test_every_scene_comes_once_an_epoch() -> None:
@@ -44,18 +44,18 @@ def test_every_scene_comes_once_an_epoch() -> None:
 
 
 def test_orders_repeat_and_have_views_as_they_should() -> None:
-    orders = [head_order(3, index, 64, 64, 0.25) for index in range(400)]
-    assert orders == [head_order(3, index, 64, 64, 0.25) for index in range(400)]
-    views = Counter(order.context for order in orders)
-    assert views.keys() == head_training.VIEW_SHARES.keys() and views[2] == pytest.approx(300, abs=30)
-    assert sum(order.real for order in orders) == pytest.approx(100, abs=30)
+    specs = [head_spec(3, index, 64, 64, 0.25) for index in range(400)]
+    assert specs == [head_spec(3, index, 64, 64, 0.25) for index in range(400)]
+    views = Counter(spec.context for spec in specs)
+    assert views.keys() == head_training.VIEW_COUNT_PROBABILITIES.keys() and views[2] == pytest.approx(300, abs=30)
+    assert sum(spec.real for spec in specs) == pytest.approx(100, abs=30)
 
 
 def test_features_are_computed_once_and_give_the_same_gaussians(cache: FeatureCache) -> None:
     """What comes off the disk predicts what the whole network does, but for bytes and half precision."""
-    order = Order(11, 2, (1,), 64, 64)
-    sample = cache.load(order)
-    views = draw_views(order)
+    spec = SampleSpec(11, 2, (1,), 64, 64)
+    sample = cache.load(spec)
+    views = generate_views(spec)
     with torch.no_grad():
         whole = cache.model(views.images, views.extrinsics, views.intrinsics, views.near, views.far)
         cameras = head_training.cameras_of(sample.views)
@@ -63,18 +63,18 @@ def test_features_are_computed_once_and_give_the_same_gaussians(cache: FeatureCa
     assert torch.equal(cached.depth, whole.depth)
     assert (cached.raw - whole.raw).abs().max() < 0.05 * whole.raw.std()
 
-    def fail(_: Order) -> Views:
+    def fail(_: SampleSpec) -> Views:
         raise AssertionError("drawn again")
 
-    again = FeatureCache(cache.folder.parent, cache.model, fail, "test").load(order)
+    again = FeatureCache(cache.folder.parent, cache.model, fail, "test").load(spec)
     assert torch.equal(again.inputs.context, sample.inputs.context)
     other = FeatureCache(cache.folder.parent, new_model(CONFIG, seed=1), fail, "test")
     with pytest.raises(AssertionError, match="drawn again"):  # features of other weights are others
-        other.load(order)
+        other.load(spec)
 
 
 def test_saturated_opacity_is_reset_and_any_other_left(cache: FeatureCache) -> None:
-    samples = [cache.load(Order(11, 2, (1,), 64, 64))]
+    samples = [cache.load(SampleSpec(11, 2, (1,), 64, 64))]
     model = cache.model
     bias = model.gaussians.head2.bias
     assert bias is not None
@@ -99,7 +99,7 @@ def _opacity_and_scale(model: torch.nn.Module, sample: HeadSample) -> tuple[floa
 
 
 def test_only_the_head_gets_gradients(cache: FeatureCache) -> None:
-    loss, entry = head_loss(cache.model, cache.load(Order(11, 2, (1, 2), 64, 64)), 0, None)
+    loss, entry = head_loss(cache.model, cache.load(SampleSpec(11, 2, (1, 2), 64, 64)), 0, None)
     loss.backward()
     got = {name for name, p in cache.model.named_parameters() if p.grad is not None and p.grad.abs().sum() > 0}
     assert got and all(name.startswith(HEAD_PREFIXES) for name in got)

@@ -13,16 +13,16 @@ import pytest
 import torch
 from idesplat.runtime.errors import InputError
 from idesplat.tools.training.cli import CHECKPOINT, LOG, Run, _work
-from idesplat.tools.training.parallel import Team, mean_entries, other_processes
+from idesplat.tools.training.parallel import Team, mean_entries, spawn_workers
 from test_train import SETTINGS, SMALL
 
-TWO_STEPS = replace(SETTINGS, gradual=False, steps=2, batch=2)
+TWO_STEPS = replace(SETTINGS, curriculum=False, steps=2, batch=2)
 
 
 def trained(folder: Path, processes: int) -> tuple[dict[str, torch.Tensor], list[dict[str, float]]]:
     folder.mkdir()
     run = Run(folder, TWO_STEPS, SMALL, team=Team(0, processes))
-    with other_processes(processes, _work, folder, TWO_STEPS, SMALL, None, 1, 10):
+    with spawn_workers(processes, _work, folder, TWO_STEPS, SMALL, None, 1, 10):
         run.go(1e9, 10)
     entries = [json.loads(line) for line in (folder / LOG).read_text().splitlines()]
     return torch.load(folder / CHECKPOINT, weights_only=True)["training"]["weights"], entries

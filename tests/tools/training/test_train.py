@@ -29,8 +29,8 @@ from idesplat.tools.training.captures import FolderScenes
 from idesplat.tools.training.cli import CHECKPOINT, CURVES, LOG, PICTURES, Run, Settings
 from idesplat.tools.training.initialization import new_model
 from idesplat.tools.training.log import TrainingLog
-from idesplat.tools.training.scenes import Order, draw_views, drawn_ahead, training_order
-from idesplat.tools.training.schedule import Objective, Phase, curriculum, phase_at, rate_at
+from idesplat.tools.training.scenes import SampleSpec, generate_views, prefetch, training_spec
+from idesplat.tools.training.schedule import Objective, Phase, lr_factor, phase_at, training_phases
 from idesplat.tools.training.state import TrainingState
 from idesplat.tools.training.step import scene_loss, with_input_view
 
@@ -80,7 +80,7 @@ def test_perfect_depth_costs_nothing_and_more_error_more() -> None:
     costs = [float(losses.inverse_depth_loss(truth + error, truth, bins)) for error in (0.001, 0.01, 0.1, 1.0)]
     assert costs == sorted(costs)
     # A small constant error has no gradient along x and y.
-    by_hand = 0.001 / 0.05 + losses.RELATIVE_SHARE * (1 + 0.001 / truth).log().mean()
+    by_hand = 0.001 / 0.05 + losses.RELATIVE_WEIGHT * (1 + 0.001 / truth).log().mean()
     assert costs[0] == pytest.approx(float(by_hand), rel=0.02)
 
 
@@ -98,7 +98,7 @@ def test_gaussians_are_held_to_the_middle_of_their_pixels_alone() -> None:
     raw[:, 1:3] = 0.0
     assert losses.offset_loss(raw) == 0
     raw[:, 1] = math.log(3)  # sigmoid 0.75, of x alone
-    assert float(losses.offset_loss(raw)) == pytest.approx(losses.OFFSET_SHARE * 0.25 / 2, rel=1e-5)
+    assert float(losses.offset_loss(raw)) == pytest.approx(losses.OFFSET_WEIGHT * 0.25 / 2, rel=1e-5)
 
 
 def test_large_errors_of_an_image_do_not_rule() -> None:
@@ -108,11 +108,11 @@ def test_large_errors_of_an_image_do_not_rule() -> None:
     expected = 0.003 * (math.log(1 + 0.01 / 0.003) + math.log(1 + 1 / 0.003)) / 2
     assert float(losses.render_loss(rendered, truth, None)) == pytest.approx(expected, rel=1e-5)
     weighted = losses.render_loss(rendered, truth, lambda a, b: (a - b).mean())
-    assert float(weighted) == pytest.approx(expected + losses.LPIPS_SHARE * 0.55, rel=1e-5)
+    assert float(weighted) == pytest.approx(expected + losses.LPIPS_WEIGHT * 0.55, rel=1e-5)
 
 
 def test_an_input_view_is_rendered_beside_the_novel_ones() -> None:
-    views = draw_views(Order(11, 2, (1, 2), 32, 32))
+    views = generate_views(SampleSpec(11, 2, (1, 2), 32, 32))
     shown = with_input_view(views, 1)
     assert torch.equal(shown.target_images[:2], views.target_images) and len(shown.target_images) == 3
     assert torch.equal(shown.target_images[2], views.images[1])
@@ -164,13 +164,13 @@ def test_lpips_only_where_it_needs_no_download(
 
 
 def test_curriculum_and_rates() -> None:
-    phases = curriculum(Objective.BOTH, gradual=True)
+    phases = training_phases(Objective.BOTH, curriculum=True)
     seen = [phase_at(phases, step, 100) for step in range(100)]
     assert seen[0].units == 1 and seen[-1].units == 3 and seen[-1].gaussians and seen[-1].shrink == 1
     assert [phase.units for phase in seen] == sorted(phase.units for phase in seen)
-    assert not any(phase.gaussians for phase in curriculum(Objective.DEPTH, gradual=True))
-    assert curriculum(Objective.PHOTOMETRIC, gradual=True) == (EVERYTHING,)
-    rates = [rate_at(phases, step, 1000) for step in range(1000)]
+    assert not any(phase.gaussians for phase in training_phases(Objective.DEPTH, curriculum=True))
+    assert training_phases(Objective.PHOTOMETRIC, curriculum=True) == (EVERYTHING,)
+    rates = [lr_factor(phases, step, 1000) for step in range(1000)]
     peak = rates.index(max(rates))
     assert rates[peak] == 1 and rates[:peak] == sorted(rates[:peak]) and rates[peak:] == sorted(rates[peak:])[::-1]
     assert rates[0] > 0 and rates[-1] == pytest.approx(0.01, abs=1e-3)
@@ -180,13 +180,13 @@ def test_curriculum_and_rates() -> None:
 
 
 def test_scenes_come_in_order_and_repeat() -> None:
-    orders = [training_order(5, step, 0, True, 32, 32, many=True) for step in range(120)]
-    assert orders == [training_order(5, step, 0, True, 32, 32, many=True) for step in range(120)]
-    assert len({order.seed for order in orders}) == 120 and {order.context for order in orders} == {2, 3}
-    drawn = list(drawn_ahead(iter(orders[:7]), draw_views))
-    for order, views in zip(orders, drawn, strict=False):
-        assert views.images.shape == (order.context, 3, 32, 32)
-        again = next(drawn_ahead(iter([order]), draw_views))
+    specs = [training_spec(5, step, 0, True, 32, 32, many=True) for step in range(120)]
+    assert specs == [training_spec(5, step, 0, True, 32, 32, many=True) for step in range(120)]
+    assert len({spec.seed for spec in specs}) == 120 and {spec.context for spec in specs} == {2, 3}
+    drawn = list(prefetch(iter(specs[:7]), generate_views))
+    for spec, views in zip(specs, drawn, strict=False):
+        assert views.images.shape == (spec.context, 3, 32, 32)
+        again = next(prefetch(iter([spec]), generate_views))
         assert torch.equal(views.images, again.images) and torch.equal(views.inverse_depth, again.inverse_depth)
 
 
@@ -194,8 +194,8 @@ def test_scenes_come_in_order_and_repeat() -> None:
 def test_a_few_steps_on_one_scene_learn(objective: Objective) -> None:
     """Depth and novel views each get better where they are asked for."""
     state = TrainingState(SMALL, seed=0, lr=3e-3, vit_lr=3e-3)
-    views = next(drawn_ahead(iter([Order(11, 2, (1,), 64, 64)]), draw_views))
-    phase = curriculum(objective, gradual=False)[0]
+    views = next(prefetch(iter([SampleSpec(11, 2, (1,), 64, 64)]), generate_views))
+    phase = training_phases(objective, curriculum=False)[0]
     entries = []
     for _ in range(14):
         loss, entry = scene_loss(state.model, views, phase, objective, None)
@@ -357,22 +357,22 @@ def test_photographs_are_trained_on_by_their_views_alone(scene: Path, tmp_path: 
     assert cv2.imread(str(tmp_path / PICTURES)).shape == (4 * 64, 4 * 64, 3)
 
 
-def test_folders_are_drawn_from_as_ordered(scene: Path) -> None:
+def test_folder_samples_follow_their_spec(scene: Path) -> None:
     scenes = FolderScenes([scene], near=1, far=20)
-    order = Order(5, 2, (1,), 64, 96)
-    first, again = scenes.draw(order), scenes.draw(order)
+    spec = SampleSpec(5, 2, (1,), 64, 96)
+    first, again = scenes.load(spec), scenes.load(spec)
     assert torch.equal(first.images, again.images) and torch.equal(first.target_images, again.target_images)
     assert first.images.shape == (2, 3, 64, 96) and first.target_images.shape == (1, 3, 64, 96)
     places = torch.cat([first.extrinsics, first.target_extrinsics])[:, :3, 3]
     assert len(places.unique(dim=0)) == 3
-    closer = scenes.draw(replace(order, closer=(2,)))
-    corner = (2 * first.target_intrinsics[0, :2, 2] - closer.target_intrinsics[0, :2, 2]).numpy()  # in windows
+    zoomed = scenes.load(replace(spec, target_zooms=(2,)))
+    corner = (2 * first.target_intrinsics[0, :2, 2] - zoomed.target_intrinsics[0, :2, 2]).numpy()  # in windows
     left, top = (corner * (96, 64)).round().astype(int)
     shown = first.target_images[0].repeat_interleave(2, 1).repeat_interleave(2, 2)
     shown = shown[:, top : top + 64, left : left + 96]
-    assert torch.equal(first.images, closer.images) and (left > 0 or top > 0)
-    assert (closer.target_images[0] - shown).abs().mean() < 0.05
-    assert len(scenes.draw(Order(5, 4, (1, 2), 64, 96)).images) == 2  # of the 4 photographs that are not held out
+    assert torch.equal(first.images, zoomed.images) and (left > 0 or top > 0)
+    assert (zoomed.target_images[0] - shown).abs().mean() < 0.05
+    assert len(scenes.load(SampleSpec(5, 4, (1, 2), 64, 96)).images) == 2  # of the 4 photographs that are not held out
 
 
 def test_validation_renders_photographs_that_training_never_uses(
@@ -397,10 +397,10 @@ def test_validation_renders_photographs_that_training_never_uses(
     settings = replace(SETTINGS, objective="photometric", data=[str(scene)])
     run = Run(tmp_path, settings, SMALL)
     for seed in range(40):
-        run.source(Order(seed, 2, (1, 2), 64, 64))
+        run.source(SampleSpec(seed, 2, (1, 2), 64, 64))
     now = "validate"
     for seed in range(5):
-        run.held_out(Order(seed, 2, (1,), 64, 64))
+        run.held_out(SampleSpec(seed, 2, (1,), 64, 64))
     assert used == {"train": {"001.png", "002.png", "003.png", "004.png"}, "validate": {"000.png"}}
 
 
