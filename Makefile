@@ -51,9 +51,9 @@ runs/textures:
 # The successor of the bundled model, trained from nothing: some ten hours of two cores. Each command resumes where it was
 # stopped. How the bundled weights were made: MODEL_CARD.md.
 weights: setup runs/textures
-	$(BIN)/idesplat-train --out runs/lite --preset idesplat-lite --textures runs/textures --steps 24000 --batch 2 \
+	$(BIN)/idesplat train --out runs/lite --preset idesplat-lite --textures runs/textures --steps 24000 --batch 2 \
 		--processes 2 --precision bf16 --size 256 --seed 0
-	$(BIN)/idesplat-train --out runs/head --train head --init runs/lite/last.ckpt --preset idesplat-lite \
+	$(BIN)/idesplat train --out runs/head --train head --init runs/lite/last.ckpt --preset idesplat-lite \
 		--textures runs/textures --scenes 2000 --steps 5000 --batch 2 --processes 2 --precision bf16 --lr 3e-4 \
 		--size 256 --seed 1
 	$(BIN)/python -P -m idesplat.tools.training.release runs/head/last.ckpt --preset idesplat-lite

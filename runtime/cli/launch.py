@@ -1,4 +1,4 @@
-"""Entry points of the commands: Ctrl-C is heard before what a command needs is loaded."""
+"""Entry points of the installed commands: Ctrl-C is handled before the modules that a command needs are imported."""
 
 import signal
 from functools import partial
@@ -7,19 +7,14 @@ from importlib import import_module
 from ..errors import SIGNALLED
 
 
-def _launch(module: str) -> None:
+def _launch(module: str, attribute: str) -> None:
     try:
-        import_module(module, __package__).main()
+        command = getattr(import_module(module, __package__), attribute)
+        import_module(".terminal", __package__).run(command)
     except KeyboardInterrupt:
         raise SystemExit(SIGNALLED + signal.SIGINT) from None
 
 
-bench = partial(_launch, "...tools.benchmark.cli")
-cameras = partial(_launch, ".cameras")
-convert = partial(_launch, ".convert")
-evaluate = partial(_launch, "...tools.evaluation.cli")
-export = partial(_launch, "...export.cli")
-infer = partial(_launch, ".infer")
-render = partial(_launch, ".render")
-train = partial(_launch, "...tools.training.cli")
-view = partial(_launch, ".view")
+idesplat = partial(_launch, ".application", "app")
+export = partial(_launch, "...export.cli", "export")
+infer = partial(_launch, ".infer", "infer")

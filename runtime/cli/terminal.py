@@ -28,6 +28,7 @@ from ..errors import (
 )
 
 STDERR = 2
+HELP_OPTIONS = {"help_option_names": ["-h", "--help"]}  # typer's settings of a context
 # Besides SIGINT. Windows has no SIGHUP.
 ENDING_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 
@@ -38,16 +39,21 @@ def run(command: "Callable[..., Any] | typer.Typer") -> None:
     Ends it with SystemExit where the status is not 0: 2 for wrong arguments, 128 and the signal's number after a
     signal. While it runs, SIGTERM and SIGHUP clean up as Ctrl-C does, and libraries' warnings are not shown.
     """
-    if not isinstance(command, typer.Typer):
-        app = typer.Typer(add_completion=False)
-        app.command()(command)
-        command = app
     with _ending_by_signals() as received, _own_streams(), _without_warnings(), _without_native_messages():
-        status = _status(command)
+        status = _status(as_application(command))
     if received and status == SIGNALLED + signal.SIGINT:  # typer takes each for Ctrl-C
         status = SIGNALLED + received[-1]
     if status:
         raise SystemExit(status)
+
+
+def as_application(command: "Callable[..., Any] | typer.Typer") -> typer.Typer:
+    """A function with typer's parameters as an application of that one command."""
+    if isinstance(command, typer.Typer):
+        return command
+    app = typer.Typer(add_completion=False, context_settings=HELP_OPTIONS)
+    app.command()(command)
+    return app
 
 
 def say(*lines: str) -> None:
@@ -102,7 +108,7 @@ def _report_usage(error: Any) -> int:
         error.show()
     else:
         where = f"; {context.command_path} --help lists what it takes" if context else ""
-        report_error(error.format_message().rstrip(".") + where)
+        report_error(error.format_message().rstrip(".?") + where)
     return EXIT_STATUS
 
 

@@ -20,9 +20,9 @@ from camera_cases import known
 from conftest import SMALL
 from hypothesis import given
 from hypothesis import strategies as st
+from idesplat import Predictor
 from idesplat.export.existing_exports import foreign_entries, is_our_graph
 from idesplat.model.checkpoint import CheckpointError, read_state_dict
-from idesplat.runtime import Predictor
 from idesplat.runtime.cameras.io import CameraFormat, read_cameras, write_cameras
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.images.exif import exif_focal, given_focal

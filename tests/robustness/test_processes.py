@@ -67,8 +67,8 @@ def test_no_code_of_a_folder_of_cameras_runs(tmp_path):
     for name, text in MODEL.items():
         (model / name).write_text(text)
     sprung = set_traps(tmp_path)
-    script = Path(sys.executable).with_name("idesplat-cameras")  # as users call it
-    done = subprocess.run([script, "convert", ".", "out.json"], cwd=tmp_path, capture_output=True, text=True)
+    script = Path(sys.executable).with_name("idesplat")  # as users call it
+    done = subprocess.run([script, "cameras", "convert", ".", "out.json"], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "read 2 cameras as colmap" in done.stdout
     assert not sprung.exists()
@@ -282,7 +282,7 @@ def test_ctrl_c_while_a_command_is_loaded(tmp_path, monkeypatch, capsys):
     (tmp_path / "slow_to_load.py").write_text("raise KeyboardInterrupt")
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(SystemExit) as stop:
-        launch._launch("slow_to_load")
+        launch._launch("slow_to_load", "command")
     assert stop.value.code == 130
     assert capsys.readouterr() == ("", "")
 

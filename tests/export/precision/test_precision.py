@@ -6,9 +6,9 @@ import numpy as np
 import onnx
 import pytest
 from conftest import run_command
+from idesplat import Predictor
 from idesplat.export import cli
 from idesplat.export.stages import example_inputs
-from idesplat.runtime import Predictor
 from idesplat.runtime.inference.metadata import INPUTS, OUTPUTS
 from onnx import TensorProto
 

@@ -307,7 +307,7 @@ def test_unknown_content_names_what_is_known(tmp_path):
 def test_reading_colmap_leaves_pycolmap_out_of_this_process(tmp_path):
     colmap_model(known(["0.jpg"])).write_binary(tmp_path)
     code = (
-        "import sys; from idesplat.runtime import read_cameras; "
+        "import sys; from idesplat import read_cameras; "
         f"assert len(read_cameras({str(tmp_path)!r})) == 1 and 'pycolmap' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

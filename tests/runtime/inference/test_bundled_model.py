@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from idesplat.runtime import InputError, Predictor, read_cameras
+from idesplat import InputError, Predictor, read_cameras
 from idesplat.runtime.inference import bundled_model as module
 from idesplat.runtime.views.batch import prepare
 

@@ -12,7 +12,7 @@ import onnx.parser
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from idesplat.runtime import InputError, Predictor
+from idesplat import InputError, Predictor
 from idesplat.runtime.inference.metadata import (
     MANIFEST_NAME,
     METADATA_KEY,

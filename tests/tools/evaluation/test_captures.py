@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from conftest import run_command
-from idesplat.runtime import Predictor, read_cameras
+from idesplat import Predictor, read_cameras
 from idesplat.runtime.cameras.camera import Camera
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.inference import predictor as predictor_module

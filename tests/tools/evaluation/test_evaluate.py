@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import run_command
-from idesplat.runtime import Gaussians, Predictor, rasterize, read_cameras
+from idesplat import Gaussians, Predictor, rasterize, read_cameras
 from idesplat.runtime.cli.outputs import Outputs
 from idesplat.runtime.images.io import find_images, load_image
 from idesplat.runtime.images.resizing import fit
