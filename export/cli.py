@@ -12,7 +12,7 @@ import typer
 from ..runtime.cli.outputs import Overwrite, guards_outputs, outputs
 from ..runtime.cli.terminal import run, say, warn
 from ..runtime.errors import InputError, exit_on_input_error
-from ..runtime.images.sizes import parse_size, size_fits, size_rule
+from ..runtime.images.sizes import describe_size_rule, is_valid_size, parse_size
 from ..runtime.inference.metadata import ModelMetadata, StageFile, write_manifest
 from ..runtime.system.files import check_writable, make_folder
 
@@ -126,8 +126,8 @@ def _check_existing(out: Path | None, staged: Path | None) -> None:
 def _fitting_size(text: str, views: int | None, multiple: int) -> tuple[int, int]:
     """`HEIGHTxWIDTH`, multiples of what the network needs."""
     height, width = parse_size(text)
-    if not size_fits(height, width, multiple):
-        raise InputError(f"--size {text}: {size_rule(multiple)}")
+    if not is_valid_size(height, width, multiple):
+        raise InputError(f"--size {text}: {describe_size_rule(multiple)}")
     from .validation.cases import MOST_VIEWS_OF_A_CASE
 
     count = views or MOST_VIEWS_OF_A_CASE

@@ -17,7 +17,7 @@ from typing import Any, NoReturn
 EXIT_STATUS = 2
 SIGNALLED = 128  # a shell's exit status of a command that a signal ended is this and the signal's number
 BROKEN_PIPE = SIGNALLED + 13  # SIGPIPE, which Windows does not name
-LONGEST_ERROR = 2000  # characters: an option, or a name in a file, may have any length
+MAX_ERROR_LENGTH = 2000  # characters: an option, or a name in a file, may have any length
 
 
 class InputError(ValueError):
@@ -32,7 +32,7 @@ class Terminated(KeyboardInterrupt):
         self.signal_number = signal_number
 
 
-def refuse(path: Path, what: str, remedy: str) -> NoReturn:
+def raise_input_error(path: Path, what: str, remedy: str) -> NoReturn:
     """Raise InputError for a file: what is wrong with it, and what was expected or to do."""
     raise InputError(f"{path}: {what}; {remedy}")
 
@@ -48,8 +48,8 @@ def printable(text: str) -> str:
 def report_error(message: str) -> None:
     """Print an error as one line on stderr, where that can be written; of a very long one, beginning and end."""
     line = printable(" ".join(message.split()))
-    if len(line) > LONGEST_ERROR:
-        line = f"{line[: LONGEST_ERROR // 2]} ... {line[-LONGEST_ERROR // 2 :]}"
+    if len(line) > MAX_ERROR_LENGTH:
+        line = f"{line[: MAX_ERROR_LENGTH // 2]} ... {line[-MAX_ERROR_LENGTH // 2 :]}"
     with contextlib.suppress(OSError):
         print(f"error: {line}", file=sys.stderr)
 
@@ -90,7 +90,7 @@ def _escape(character: str) -> str:
 
 
 @contextmanager
-def located(where: str) -> Iterator[None]:
+def error_context(where: str) -> Iterator[None]:
     """Put `where` (a file, a frame, a field) in front of the message of an InputError raised inside the block.
 
     Once only: what reads a whole file begins with its path, which may end in `where`, or lead through it.

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..geometry.intrinsics import check_intrinsics
-from ..geometry.rigid import rigid
+from ..geometry.rigid import check_rigid
 
 DISTORTION_LENGTHS = (4, 5, 8, 12, 14)  # that OpenCV's model may have
 FISHEYE_LENGTH = 4
@@ -39,17 +39,17 @@ class Camera:
     depth_range: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        if not (0 < self.width <= LARGEST_SIDE and 0 < self.height <= LARGEST_SIDE):
+        if not (0 < self.width <= MAX_SIDE and 0 < self.height <= MAX_SIDE):
             size = f"{self.width:.6g} x {self.height:.6g}"
-            raise InputError(f"the image's size is {size}, expected 1 to {LARGEST_SIDE} pixels")
+            raise InputError(f"the image's size is {size}, expected 1 to {MAX_SIDE} pixels")
         check_intrinsics(self.K, self.width, self.height)
         _check_distortion(self.distortion, self.fisheye)
         if self.depth_range is not None:
             _check_depth_range(self.depth_range)
-        object.__setattr__(self, "extrinsics", rigid(self.extrinsics))
+        object.__setattr__(self, "extrinsics", check_rigid(self.extrinsics))
 
 
-def resized(camera: Camera, width: int, height: int) -> Camera:
+def resize_camera(camera: Camera, width: int, height: int) -> Camera:
     """Return the camera of the same picture at another size in pixels.
 
     Raises InputError if the aspect differs by more than rounding each side to a whole pixel explains.
@@ -75,7 +75,7 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
     return replace(camera, width=width, height=height, K=scale @ camera.K)
 
 
-def relative_cameras(cameras: Sequence[Camera], offset: np.ndarray) -> list[Camera]:
+def offset_cameras(cameras: Sequence[Camera], offset: np.ndarray) -> list[Camera]:
     """Cameras in a world whose origin is at `offset` [3] of theirs, as that of a scene with an offset is."""
     if not offset.any():
         return list(cameras)
@@ -106,4 +106,4 @@ def _check_depth_range(depth_range: tuple[float, float]) -> None:
         raise InputError(f"the range of depth is {depth_range}, expected 0 < nearest < farthest")
 
 
-LARGEST_SIDE = 1_000_000  # pixels
+MAX_SIDE = 1_000_000  # pixels

@@ -2,14 +2,14 @@
 
 Inside, a pose is camera-to-world with OpenCV axes (x right, y down, z forward) and K is in pixels with the centre of
 the top left pixel at (.5, .5). To read another format, write one module with a function `read` that returns `Camera`s,
-and name it in `CameraFormat` and `recognise`; `Camera` itself checks what every format can get wrong.
+and name it in `CameraFormat` and `detect_format`; `Camera` itself checks what every format can get wrong.
 """
 
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path, PurePosixPath
 
-from ..errors import InputError, located
+from ..errors import InputError, error_context
 from ..system.files import open_regular
 from .camera import Camera
 from .format_names import COLMAP_PARTS, CameraFormat
@@ -18,18 +18,18 @@ START = 4096  # bytes of a file that tell its format
 RE10K_COLUMNS = 19
 
 
-def read_cameras(path: Path, pictures: Sequence[Path] = (), form: CameraFormat | None = None) -> list[Camera]:
+def read_cameras(path: Path, images: Sequence[Path] = (), camera_format: CameraFormat | None = None) -> list[Camera]:
     """Read a file, or a folder, of cameras.
 
-    pictures: the photographs that the cameras belong to. Some formats do not name them, or do not give their size, and
+    images: the photographs that the cameras belong to. Some formats do not name them, or do not give their size, and
     then need them here or beside the file; the module of each format says which.
-    form: the format, where the content is not to tell it.
+    camera_format: the format, where the content is not to tell it.
     Raises InputError naming the file, the entry and the field.
     """
     path = Path(path)
-    with located(str(path)):
-        reader = import_module(f".formats.{form or recognise(path)}", __package__)
-        cameras: list[Camera] = reader.read(path, pictures)
+    with error_context(str(path)):
+        reader = import_module(f".formats.{camera_format or detect_format(path)}", __package__)
+        cameras: list[Camera] = reader.read(path, images)
         _check_names(cameras)
     return cameras
 
@@ -47,7 +47,7 @@ def write_cameras(path: Path, cameras: Sequence[Camera]) -> None:
     writer.write(path, cameras)
 
 
-def recognise(path: Path) -> CameraFormat:
+def detect_format(path: Path) -> CameraFormat:
     """The format of a file or folder of cameras, by what it holds; raises InputError if it is none of them."""
     if path.is_dir():
         return _recognise_folder(path)

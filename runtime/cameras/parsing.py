@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, located
-from ..geometry.rigid import rigid
+from ..errors import InputError, error_context
+from ..geometry.rigid import check_rigid
 from ..system.files import read_bytes
 
 EXPECTED = "a file of cameras"
@@ -85,8 +85,8 @@ def pose(entry: Mapping[str, Any], field: str) -> np.ndarray:
     rows = entry.get(field)
     if not (isinstance(rows, list) and len(rows) == 4 and all(isinstance(row, list) and len(row) == 4 for row in rows)):
         raise InputError(f"{field} is {shown(rows)}, expected the camera's pose as 4 rows of 4 numbers")
-    with located(field):
-        return rigid(np.array([[finite(value, f"row {i}") for value in row] for i, row in enumerate(rows)]))
+    with error_context(field):
+        return check_rigid(np.array([[finite(value, f"row {i}") for value in row] for i, row in enumerate(rows)]))
 
 
 def numbers(words: Sequence[str]) -> list[float]:

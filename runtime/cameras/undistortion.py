@@ -21,7 +21,7 @@ def undistort(image: np.ndarray, camera: Camera) -> tuple[np.ndarray, Camera]:
     return straight, replace(camera, distortion=None, fisheye=False)
 
 
-def seen_by_lens(camera: Camera) -> np.ndarray:
+def undistortion_valid_mask(camera: Camera) -> np.ndarray:
     """Where `undistort` shows what the lens saw, and nothing filled in: bool, [height, width]."""
     if camera.distortion is None:
         return np.ones((camera.height, camera.width), bool)

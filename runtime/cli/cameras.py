@@ -43,7 +43,7 @@ def convert(
     overwrite: Overwrite = False,
 ) -> None:
     """Read cameras and write them as JSON, camera-to-world with OpenCV axes, pixels with centres at .5."""
-    from ..cameras.io import read_cameras, recognise, write_cameras
+    from ..cameras.io import detect_format, read_cameras, write_cameras
     from ..images.io import find_images
     from .input_files import camera_files, given_images
 
@@ -55,7 +55,7 @@ def convert(
     outputs().writes("", [out])
     found = read_cameras(cameras, find_images(pictures) if pictures else (), camera_format)
     write_cameras(out, found)
-    say(f"read {len(found)} cameras as {camera_format or recognise(cameras)}: {_lenses(found)}")
+    say(f"read {len(found)} cameras as {camera_format or detect_format(cameras)}: {_lenses(found)}")
     say(f"wrote {out}")
 
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from ..inference.inputs import Inputs, Request
     from ..inference.predictor import Prediction, Predictor
     from ..splats.filtering import FilterOptions
-    from ..views.batch import Views
+    from ..views.batch import ViewBatch
     from ..views.depth_range import DepthRange
 
 # Frames of the path that --render draws from the first view to the last.
@@ -297,7 +297,7 @@ def _announce_pictures(
         run.writes("--render", [render / name for name in (*map(_view_name, stems), *_path_names())])
 
 
-def _stems(views: "Views") -> list[str]:
+def _stems(views: "ViewBatch") -> list[str]:
     """What the files that are made of the views are called, but for their endings."""
     return name_files([camera.name for camera in views.cameras])
 
@@ -373,21 +373,23 @@ def _check_offset(offset: str | None) -> None:
         parse_offset(offset)
 
 
-def _place(views: "Views", offset: str | None, span: "DepthRange") -> "tuple[Views, list[str]]":
+def _place(views: "ViewBatch", offset: str | None, span: "DepthRange") -> "tuple[ViewBatch, list[str]]":
     """The views relative to --offset, and lines for the user."""
-    from ..views.world_offset import with_offset
+    from ..views.world_offset import apply_offset
 
-    return with_offset(views, offset, span.near)
+    return apply_offset(views, offset, span.near)
 
 
-def _predict(views: "Views", predictor: "Predictor", span: "DepthRange") -> "Prediction":
+def _predict(views: "ViewBatch", predictor: "Predictor", span: "DepthRange") -> "Prediction":
     from ..system.progress import working
 
     with working("predicting depth and Gaussians"):
         return predictor.predict_views(views, span.near, span.far)
 
 
-def _clean(prediction: "Prediction", views: "Views", cleaning: "FilterOptions") -> "tuple[Prediction, dict[str, int]]":
+def _clean(
+    prediction: "Prediction", views: "ViewBatch", cleaning: "FilterOptions"
+) -> "tuple[Prediction, dict[str, int]]":
     """The prediction without what is to be left out, and how much that was."""
     from ..splats.filtering import describe_removed, filter_gaussians
 
@@ -397,7 +399,7 @@ def _clean(prediction: "Prediction", views: "Views", cleaning: "FilterOptions") 
     return replace(prediction, gaussians=gaussians), taken
 
 
-def _write_scene(prediction: "Prediction", views: "Views", out: Path, cleaning: "FilterOptions") -> None:
+def _write_scene(prediction: "Prediction", views: "ViewBatch", out: Path, cleaning: "FilterOptions") -> None:
     """Write the splats, points or surface that the file's name asks for."""
     from ..splats.io import is_surface, lost_offset, write_splats
     from ..splats.mesh import LARGEST_JUMP, faces_from_depth
@@ -418,7 +420,7 @@ def _write_scene(prediction: "Prediction", views: "Views", out: Path, cleaning: 
 
 def _write_pictures(
     prediction: "Prediction",
-    views: "Views",
+    views: "ViewBatch",
     save_depth: Path | None,
     depth_format: DepthFormat | None,
     render: Path | None,
@@ -434,7 +436,7 @@ def _write_pictures(
 
 
 def _write_depth(
-    prediction: "Prediction", views: "Views", stems: list[str], folder: Path, depth_format: DepthFormat | None
+    prediction: "Prediction", views: "ViewBatch", stems: list[str], folder: Path, depth_format: DepthFormat | None
 ) -> list[Path]:
     """Write depth maps in the form that is asked for; the paths written."""
     from ..inference.colmap_workspace import write_workspace
@@ -444,12 +446,12 @@ def _write_depth(
     return write(folder, stems, prediction, views)
 
 
-def _write_renders(prediction: "Prediction", views: "Views", stems: list[str], folder: Path) -> list[Path]:
+def _write_renders(prediction: "Prediction", views: "ViewBatch", stems: list[str], folder: Path) -> list[Path]:
     """The scene from the input views, and along a smooth path from the first to the last."""
     import numpy as np
 
     from ..geometry.trajectories import interpolate_extrinsics
-    from ..images.writing import save_png
+    from ..images.png import save_png
     from ..rendering.render import render_view
     from ..system.progress import progress
 

@@ -75,18 +75,18 @@ def nearby_images(path: Path, cameras: Iterable["Camera"]) -> list[Path]:
     path: the file or folder that the cameras were read from, such as `sparse/0` beside a folder `images`.
     """
     from ..cameras.image_files import IMAGE_FOLDERS, image_roots
-    from ..images.io import SUFFIXES, stem
+    from ..images.io import SUFFIXES, image_stem
 
     stems_in = defaultdict(set)  # folder of a name -> its stems
     for camera in cameras:
         name = _posix(camera.name)
-        stems_in[name.parent].add(stem(name))
+        stems_in[name.parent].add(image_stem(name))
     roots, names = image_roots(path), ("", *IMAGE_FOLDERS, UNDISTORTED_FROM)
     found = []
     for below, stems in stems_in.items():
         for place in dict.fromkeys(root / name / below for root in roots for name in names):
             children = (child for child in _children(place) if child.suffix.lower() in SUFFIXES)
-            found += [child for child in children if stem(child) in stems]
+            found += [child for child in children if image_stem(child) in stems]
     return found
 
 

@@ -25,8 +25,8 @@ from typing import Annotated, Any, Self, TextIO
 import typer
 
 from ..errors import InputError
-from ..system.files import GUARD, check_writable, replacing
-from ..system.written_files import WrittenFile, add_to_record, matches, read_record
+from ..system.files import GUARD, atomic_write, check_writable
+from ..system.output_records import WrittenFile, add_to_record, is_unchanged, read_record
 
 STANDARD_OUTPUT = Path("-")  # as the value of --json
 UNNAMED = "image"  # for a file whose image has no name
@@ -120,7 +120,7 @@ class Outputs:
         if folder not in self._records:
             self._records[folder] = read_record(folder)
         entry = self._records[folder].get(Path(path).name)
-        return entry.command if entry is not None and matches(Path(path), entry) else None
+        return entry.command if entry is not None and is_unchanged(Path(path), entry) else None
 
     def check(self, path: Path) -> None:
         """Check a file that is about to be written, unless it was announced, and make its folder."""
@@ -224,7 +224,7 @@ def write_json(path: Path, text: str) -> None:
     if path == STANDARD_OUTPUT:
         print(text, file=outputs().stdout)
         return
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
 
 
@@ -246,10 +246,10 @@ def name_files(images: Sequence[str], endings: Sequence[str] = ("",)) -> list[st
     of the names differ in case alone, and none is another one with an ending, so that `a` with the ending `-depth` and
     `a-depth` are told apart.
     """
-    from ..images.io import stem  # loads OpenCV, which a help text does not need
+    from ..images.io import image_stem  # loads OpenCV, which a help text does not need
 
     paths = [PurePosixPath(image.replace("\\", "/")) for image in images]
-    stems = [stem(path) or UNNAMED for path in paths]
+    stems = [image_stem(path) or UNNAMED for path in paths]
     if _distinct(stems, endings):
         return stems
     levels = zip(*(path.parts[:-1] for path in paths), strict=False)

@@ -8,12 +8,13 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from ..cameras.camera import Camera, relative_cameras
+from ..cameras.camera import Camera, offset_cameras
 from ..cameras.io import CameraFormat, read_cameras
 from ..errors import InputError, exit_on_input_error
+from ..images.colormaps import colormap_depth, inverse_depth_range
+from ..images.png import save_png
 from ..images.sizes import parse_size
 from ..images.video_writer import check_video_support, open_video
-from ..images.writing import depth_colours, inverse_depth_range, save_png
 from ..rendering.cameras import (
     FULL_TURN,
     MOST_FRAMES,
@@ -30,7 +31,7 @@ from ..rendering.render import render_view
 from ..rendering.types import Rendering
 from ..splats.gaussians import Gaussians
 from ..splats.io import read_offset, read_splats
-from ..system.files import replacing
+from ..system.files import atomic_write
 from ..system.progress import progress
 from .input_files import camera_files, named_images, nearby_images
 from .outputs import Overwrite, guards_outputs, name_files, outputs
@@ -83,7 +84,7 @@ def render(
     _check_out(out)
     if path and orbit:
         raise InputError("--path and --orbit: expected one of them")
-    views = read_cameras(cameras, form=camera_format) if cameras else []
+    views = read_cameras(cameras, camera_format=camera_format) if cameras else []
     if path and not views:
         raise InputError("--path: needs the cameras that it leads through; give --cameras, or use --orbit")
     kinds = [COLOUR, *[DEPTH] * depth, *[ALPHA] * alpha]
@@ -91,7 +92,7 @@ def render(
     stems = _stems(names, out, kinds)
     _announce(scene, cameras, views, stems, out, kinds)
     gaussians = read_splats(scene)
-    views = relative_cameras(views, read_offset(scene))
+    views = offset_cameras(views, read_offset(scene))
     shots = _shots(gaussians, views, orbit, path, degrees, frames, size)
     check_shots(shots)
     draw = _drawer(gaussians, colour)
@@ -113,7 +114,7 @@ def main() -> None:
 def _check_out(out: Path) -> None:
     """Refuse what is not made: a kind of picture or video by its name, or any video where its library is missing."""
     from ..images.io import SUFFIXES as PICTURES
-    from ..images.video import SUFFIXES as VIDEOS
+    from ..images.video_reader import SUFFIXES as VIDEOS
 
     if out.suffix.lower() in {*PICTURES, *VIDEOS, ".gif"} - {PICTURE, VIDEO} and not out.is_dir():
         raise InputError(f"--out {out}: expected a folder, or a file that ends in {PICTURE} or {VIDEO}")
@@ -230,7 +231,7 @@ def _pictures(
             written.append(target)
         if DEPTH in kinds:
             metric = _metric_path(stem)
-            with replacing(metric) as temporary:
+            with atomic_write(metric) as temporary:
                 np.savez_compressed(temporary, depth=_depth(drawn))
             written.append(metric)
     return written
@@ -244,7 +245,7 @@ def _depth(drawn: Rendering) -> np.ndarray:
 def _picture(drawn: Rendering, kind: str, limits: tuple[float, float] | None = None) -> np.ndarray:
     """One kind of picture of a rendering, RGB in [0, 1], [height, width, 3]."""
     if kind == DEPTH:
-        return depth_colours(_depth(drawn), limits)
+        return colormap_depth(_depth(drawn), limits)
     return np.repeat(drawn.alpha[..., None], 3, axis=2) if kind == ALPHA else drawn.rgb
 
 

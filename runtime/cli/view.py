@@ -68,13 +68,13 @@ def view(
                 webbrowser.open(page)
             server.sleep_forever()
         return
-    from ..system.files import replacing
+    from ..system.files import atomic_write
     from ..system.progress import working
     from ..viewer.viser_scene import standalone_page
 
     with working("making the page"):
         page = standalone_page(gaussians, viewpoints)
-    with replacing(html) as temporary:
+    with atomic_write(html) as temporary:
         temporary.write_text(page, encoding="utf-8")
     say(f"wrote {html}: {len(gaussians):,} Gaussians, {html.stat().st_size / 1e6:.1f} MB; open it in any browser")
 
@@ -110,10 +110,10 @@ def _check_page(html: Path, scene: Path, cameras: Path | None, images: list[Path
 
 def _relative(viewpoints: "list[Viewpoint]", scene: Path) -> "list[Viewpoint]":
     """The viewpoints in the world of a scene that was written relative to an offset."""
-    from ..cameras.camera import relative_cameras
+    from ..cameras.camera import offset_cameras
     from ..splats.io import read_offset
 
-    cameras = relative_cameras([viewpoint.camera for viewpoint in viewpoints], read_offset(scene))
+    cameras = offset_cameras([viewpoint.camera for viewpoint in viewpoints], read_offset(scene))
     return [viewpoint._replace(camera=camera) for viewpoint, camera in zip(viewpoints, cameras, strict=True)]
 
 
@@ -128,32 +128,32 @@ def read_viewpoints(cameras: Path | None, form: CameraFormat | None, images: lis
     from ..system.files import scratch_folder
     from ..system.progress import progress
     from ..viewer.viser_scene import Viewpoint
-    from ..views.batch import match
-    from ..views.sources import find_photographs
+    from ..views.batch import match_images_to_cameras
+    from ..views.sources import find_input_images
 
     if cameras is None:
         return []
     if not images:
         return [
             Viewpoint(replace(camera, distortion=None, fisheye=False), None)
-            for camera in read_cameras(cameras, form=form)
+            for camera in read_cameras(cameras, camera_format=form)
         ]
     with scratch_folder() as folder:
-        files = find_photographs(images, cameras, form, folder)
-        pairs = match(files, read_cameras(cameras, files, form))
+        files = find_input_images(images, cameras, form, folder)
+        pairs = match_images_to_cameras(files, read_cameras(cameras, files, form))
         return [_viewpoint(file, camera) for file, camera in progress(pairs, "reading photographs")]
 
 
 def _viewpoint(file: Path, camera: "Camera") -> "Viewpoint":
     """A camera with its photograph, without distortion."""
-    from ..cameras.camera import resized
+    from ..cameras.camera import resize_camera
     from ..cameras.undistortion import undistort
-    from ..errors import located
+    from ..errors import error_context
     from ..images.io import load_image
     from ..viewer.viser_scene import Viewpoint
 
     photograph = load_image(file)
-    with located(str(file)):
-        camera = resized(camera, photograph.shape[1], photograph.shape[0])
+    with error_context(str(file)):
+        camera = resize_camera(camera, photograph.shape[1], photograph.shape[0])
     photograph, camera = undistort(photograph, camera)
     return Viewpoint(camera, photograph)

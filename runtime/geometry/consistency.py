@@ -2,7 +2,7 @@
 
 import numpy as np
 
-AGREEMENT = 0.05  # share of the depth by which two views may differ about a surface and still mean the same one
+DEPTH_TOLERANCE = 0.05  # share of the depth by which two views may differ about a surface and still mean the same one
 
 
 def depth_jumps(depth: np.ndarray) -> np.ndarray:
@@ -13,7 +13,9 @@ def depth_jumps(depth: np.ndarray) -> np.ndarray:
     return np.stack([cv2.dilate(view, square) / cv2.erode(view, square) - 1 for view in depth])
 
 
-def confidence(points: np.ndarray, depth: np.ndarray, extrinsics: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+def multi_view_consistency(
+    points: np.ndarray, depth: np.ndarray, extrinsics: np.ndarray, intrinsics: np.ndarray
+) -> np.ndarray:
     """The share of the other views that confirm each point, float32 [views, height, width].
 
     points: where the pixels are in the world, [views, height, width, 3]. depth: z-depth, [views, height, width].
@@ -30,16 +32,16 @@ def confidence(points: np.ndarray, depth: np.ndarray, extrinsics: np.ndarray, in
         for view in range(len(depth)):
             if view == other:
                 continue
-            pixel, z, seen = seen_from(points[view], surface.shape, extrinsics[other], intrinsics[other])
-            behind_nearest = z >= nearest.ravel()[pixel] * (1 - AGREEMENT)
-            before_farthest = z <= farthest.ravel()[pixel] * (1 + AGREEMENT)
+            pixel, z, seen = project_to_view(points[view], surface.shape, extrinsics[other], intrinsics[other])
+            behind_nearest = z >= nearest.ravel()[pixel] * (1 - DEPTH_TOLERANCE)
+            before_farthest = z <= farthest.ravel()[pixel] * (1 + DEPTH_TOLERANCE)
             confirmed[view] += seen & behind_nearest & before_farthest
             denied[view] += seen & ~behind_nearest
     judged = confirmed + denied
     return np.where(judged > 0, confirmed / np.maximum(judged, 1), 1).astype(np.float32)
 
 
-def seen_from(
+def project_to_view(
     points: np.ndarray, shape: tuple[int, ...], extrinsics: np.ndarray, intrinsics: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pixel (row * width + column), z-depth and whether it is in the picture, for points [..., 3], in one view."""

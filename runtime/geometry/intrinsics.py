@@ -4,7 +4,7 @@ import numpy as np
 
 from ..errors import InputError
 
-SHORTEST_FOCAL, LONGEST_FOCAL = 0.05, 100.0  # in image widths (heights): 169 and 0.6 degrees of view
+MIN_FOCAL, MAX_FOCAL = 0.05, 100.0  # in image widths (heights): 169 and 0.6 degrees of view
 
 
 def check_intrinsics(K: np.ndarray, width: float, height: float) -> None:
@@ -19,12 +19,12 @@ def check_intrinsics(K: np.ndarray, width: float, height: float) -> None:
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     if min(fx, fy) <= 0:
         raise InputError(f"the focal lengths are {fx:g} and {fy:g}, expected positive ones")
-    if min(fx / width, fy / height) < SHORTEST_FOCAL or max(fx / width, fy / height) > LONGEST_FOCAL:
+    if min(fx / width, fy / height) < MIN_FOCAL or max(fx / width, fy / height) > MAX_FOCAL:
         raise InputError(f"the focal lengths {fx:g} and {fy:g} are not plausible for {image}; check their unit")
     if not (-width <= cx <= 2 * width and -height <= cy <= 2 * height):
         raise InputError(f"the principal point ({cx:g}, {cy:g}) lies far outside {image}; check its unit")
 
 
-def calibration(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
+def intrinsic_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
     """K [3, 3] without skew."""
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])

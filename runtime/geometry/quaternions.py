@@ -4,16 +4,16 @@ import numpy as np
 
 # The three parts beside each largest one, in order.
 OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-SHORTEST = 1e-12  # below this a quaternion has no direction
+MIN_LENGTH = 1e-12  # below this a quaternion has no direction
 
 
-def unit_quaternions(quats: np.ndarray) -> np.ndarray:
+def normalize_quaternions(quats: np.ndarray) -> np.ndarray:
     """Quaternions wxyz [n, 4] of length 1, float32; zero, which says nothing, becomes no rotation."""
     quats = np.asarray(quats, np.float32)
     largest = np.abs(quats).max(axis=1, keepdims=True)  # first to about 1: the square of a float32 may overflow
-    quats = quats / np.where(largest > SHORTEST, largest, 1)
-    unit = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), SHORTEST)
-    unit[largest[:, 0] <= SHORTEST] = 1, 0, 0, 0
+    quats = quats / np.where(largest > MIN_LENGTH, largest, 1)
+    unit = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), MIN_LENGTH)
+    unit[largest[:, 0] <= MIN_LENGTH] = 1, 0, 0, 0
     return unit
 
 
@@ -36,7 +36,7 @@ def from_smallest_three(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
     return quats
 
 
-def rotation_matrices(quats: np.ndarray) -> np.ndarray:
+def quaternions_to_matrices(quats: np.ndarray) -> np.ndarray:
     """Rotation matrices [n, 3, 3], float64, of quaternions wxyz [n, 4] of any length; zero means no rotation."""
     quats = quats.astype(np.float64)
     w, x, y, z = (quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)).T
@@ -47,7 +47,7 @@ def rotation_matrices(quats: np.ndarray) -> np.ndarray:
     return rotations
 
 
-def quaternions_from_matrices(rotations: np.ndarray) -> np.ndarray:
+def matrices_to_quaternions(rotations: np.ndarray) -> np.ndarray:
     """Unit quaternions wxyz [n, 4] of rotation matrices [n, 3, 3].
 
     Each row of the symmetric matrix below is the quaternion times four of its parts; the longest row is the exactest.

@@ -8,7 +8,7 @@ RIGID_TOLERANCE = 1e-3  # how far a rotation's singular values may be from 1
 RIGID_ROUNDING = 1e-12  # below this a rotation is left as it is, so that what we write is read back unchanged
 
 
-def rigid(pose: np.ndarray) -> np.ndarray:
+def check_rigid(pose: np.ndarray) -> np.ndarray:
     """Return the pose [4, 4] as float64 with an orthonormal rotation.
 
     Raises InputError if it is not finite, or scaled, sheared or mirrored by more than rounding (1e-3).
@@ -20,8 +20,9 @@ def rigid(pose: np.ndarray) -> np.ndarray:
         raise InputError("the pose holds NaN or infinity, expected finite numbers")
     if np.abs(pose[3] - (0, 0, 0, 1)).max() > RIGID_TOLERANCE:
         raise InputError(f"the pose's last row is {pose[3].tolist()}, expected [0, 0, 0, 1]")
-    if np.abs(pose[:3, 3]).max() > FARTHEST:
-        raise InputError(f"the camera stands at {pose[:3, 3].tolist()}, expected coordinates below {FARTHEST:g}")
+    if np.abs(pose[:3, 3]).max() > MAX_COORDINATE:
+        position = pose[:3, 3].tolist()
+        raise InputError(f"the camera is at {position}, expected coordinates below {MAX_COORDINATE:g}")
     u, singular, vt = np.linalg.svd(pose[:3, :3])
     error = np.abs(singular - 1).max()
     if error > RIGID_TOLERANCE:
@@ -37,12 +38,12 @@ def rigid(pose: np.ndarray) -> np.ndarray:
 
 
 def invert_rigid(transform: np.ndarray) -> np.ndarray:
-    """The inverse of a pose [4, 4], so that world-to-camera becomes camera-to-world; raises InputError as `rigid`."""
-    transform = rigid(transform)
+    """The inverse of a rigid transform [4, 4]. Raises InputError as `check_rigid`."""
+    transform = check_rigid(transform)
     inverse = np.eye(4)
     inverse[:3, :3] = transform[:3, :3].T
     inverse[:3, 3] = -transform[:3, :3].T @ transform[:3, 3]
     return inverse
 
 
-FARTHEST = 1e9  # a coordinate beyond this is a mistake, and float32 could not place a scene around it
+MAX_COORDINATE = 1e9  # a coordinate beyond this is a mistake, and float32 could not place a scene around it

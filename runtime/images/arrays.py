@@ -7,7 +7,7 @@ from ..errors import InputError
 EXPECTED = "expected RGB [height, width, 3], as uint8 in 0 to 255 or as floating point in [0, 1]"
 
 
-def eight_bit_image(image: np.ndarray, name: str) -> np.ndarray:
+def as_uint8_image(image: np.ndarray, name: str) -> np.ndarray:
     """RGB [height, width, 3], as uint8 or as floating point in [0, 1], as uint8.
 
     Raises InputError, naming the image, for other shapes, types and ranges: 12 bits in uint16, 0 to 255 in float32 or

@@ -15,7 +15,7 @@ EXIF_DIRECTORY, FOCAL_LENGTH_35MM = 0x8769, 0xA405
 GIVEN = re.compile(r"(\d+(?:\.\d+)?)\s*(mm)?")
 
 
-def given_focal(text: str, width: int, height: int) -> float:
+def parse_focal(text: str, width: int, height: int) -> float:
     """The option --focal in pixels of a picture of this size: pixels (`1375`), or millimetres on 35 mm film (`26mm`).
 
     Raises InputError.
@@ -33,11 +33,11 @@ def exif_focal(path: Path, width: int, height: int) -> float | None:
 
     It is the one that the camera relates to 35 mm film, which holds for any size that the picture was scaled to.
     """
-    from .header import exif_of, opened
+    from .header import open_image, read_exif
 
     try:
-        with open_regular(path) as file, opened(path, file) as image:
-            value = exif_of(image).get_ifd(EXIF_DIRECTORY).get(FOCAL_LENGTH_35MM)
+        with open_regular(path) as file, open_image(path, file) as image:
+            value = read_exif(image).get_ifd(EXIF_DIRECTORY).get(FOCAL_LENGTH_35MM)
         focal_mm = float(value) if value is not None else 0.0
     except Exception:  # of damaged metadata Pillow makes many kinds; the picture itself is read elsewhere
         return None

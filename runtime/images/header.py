@@ -84,7 +84,7 @@ def read_header(path: Path, file: BinaryIO) -> ImageHeader:
     if start.startswith(TIFF_STARTS):
         header = _read_tiff(path, file)
     else:
-        with opened(path, file) as image:
+        with open_image(path, file) as image:
             transparent = image.mode in TRANSPARENT_MODES or "transparency" in image.info
             header = ImageHeader(str(image.format), *image.size, _orientation(image), transparent)
     _check_pixels(path, header.width, header.height)
@@ -92,7 +92,7 @@ def read_header(path: Path, file: BinaryIO) -> ImageHeader:
 
 
 @contextmanager
-def opened(path: Path, file: BinaryIO) -> Iterator[Image.Image]:
+def open_image(path: Path, file: BinaryIO) -> Iterator[Image.Image]:
     """The image that Pillow sees in `file`, not decoded, without any warning or limit of Pillow's.
 
     Raises DamagedImage, for whatever goes wrong inside the block, too.
@@ -118,7 +118,7 @@ def opened(path: Path, file: BinaryIO) -> Iterator[Image.Image]:
         Image.MAX_IMAGE_PIXELS = allowed
 
 
-def exif_of(image: Image.Image) -> Image.Exif:
+def read_exif(image: Image.Image) -> Image.Exif:
     """The EXIF data of an image, empty where it has none; not of XMP, and without decoding, unlike `getexif`."""
     if image.format == TIFF:
         return image.getexif()
@@ -148,7 +148,7 @@ def _orientation(image: Image.Image) -> int:
     if image.format == HEIF:  # libheif turns images itself
         return UPRIGHT
     try:
-        value = exif_of(image).get(ORIENTATION, UPRIGHT)
+        value = read_exif(image).get(ORIENTATION, UPRIGHT)
     except Exception:  # damaged metadata; the image may be whole
         return UPRIGHT
     return value if isinstance(value, int) and 1 <= value <= 8 else UPRIGHT

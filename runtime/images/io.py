@@ -12,8 +12,8 @@ import numpy as np
 
 from ..errors import InputError
 from ..system.files import check_regular, read_bytes
-from .header import HEIF, DamagedImage, ImageHeader, opened, read_header
-from .video import SUFFIXES as VIDEO_SUFFIXES
+from .header import HEIF, DamagedImage, ImageHeader, open_image, read_header
+from .video_reader import SUFFIXES as VIDEO_SUFFIXES
 
 # Images that are read.
 SUFFIXES = (
@@ -21,12 +21,12 @@ SUFFIXES = (
     *(".heic", ".heif", ".hif"),
 )
 # Images that are not: of a folder, they are named as left out.
-UNREAD_SUFFIXES = (
+UNSUPPORTED_SUFFIXES = (
     *(".gif", ".jxl", ".jxr", ".jpf", ".j2k", ".exr", ".hdr", ".psd", ".tga", ".svg", ".pbm", ".pnm", ".insp"),
     *(".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".sr2", ".raf", ".orf", ".rw2", ".pef", ".srw", ".raw"),
     *(".3fr", ".iiq", ".x3f"),
 )
-LARGEST_FILE = 1 << 31  # bytes
+MAX_FILE_SIZE = 1 << 31  # bytes
 NAMED = 3  # files that a note names
 HALF_PIXEL = 0.5  # OpenCV's geometry puts pixel centres at whole numbers, ours at .5
 
@@ -42,20 +42,20 @@ def find_images(given: Sequence[str | Path]) -> list[Path]:
     return sorted({os.path.abspath(path): path for path in reversed(found)}.values(), key=_natural)
 
 
-def stem(path: PurePath) -> str:
+def image_stem(path: PurePath) -> str:
     """The name without an image's suffix; `r_0.5` has none."""
     return path.stem if path.suffix.lower() in SUFFIXES else path.name
 
 
-def unread_images(given: Sequence[str | Path]) -> list[Path]:
+def unsupported_images(given: Sequence[str | Path]) -> list[Path]:
     """The images of formats that are not read, by their suffix, that given folders and globs hold, sorted."""
     found = [path for item in given for path in _files_of(item) if _is_unread(path)]
     return sorted(set(found), key=_natural)
 
 
-def describe_unread(given: Sequence[str | Path]) -> list[str]:
-    """A line that names what `unread_images` finds; none where it finds nothing."""
-    left = unread_images(given)
+def describe_unsupported(given: Sequence[str | Path]) -> list[str]:
+    """A line that names what `unsupported_images` finds; none where it finds nothing."""
+    left = unsupported_images(given)
     if not left:
         return []
     names = ", ".join(path.name for path in left[:NAMED]) + (", ..." if len(left) > NAMED else "")
@@ -71,7 +71,7 @@ def load_image(path: Path) -> np.ndarray:
     or holds floating-point values.
     """
     try:
-        content = read_bytes(path, "an image", LARGEST_FILE)
+        content = read_bytes(path, "an image", MAX_FILE_SIZE)
     except InputError as error:
         raise DamagedImage(path, str(error).removeprefix(f"{path}: ")) from None
     header = read_header(path, BytesIO(content))
@@ -122,7 +122,7 @@ def _is_image(path: Path) -> bool:
 
 
 def _is_unread(path: Path) -> bool:
-    return path.suffix.lower() in UNREAD_SUFFIXES and not path.name.startswith(".") and path.is_file()
+    return path.suffix.lower() in UNSUPPORTED_SUFFIXES and not path.name.startswith(".") and path.is_file()
 
 
 def _natural(path: Path) -> tuple[list[str | int], str]:
@@ -134,7 +134,7 @@ def _natural(path: Path) -> tuple[list[str | int], str]:
 def _decode(path: Path, content: bytes, header: ImageHeader) -> np.ndarray | None:
     """The pixels as they are stored, BGR or BGRA or grey, or None where they cannot be decoded."""
     if header.format == HEIF:
-        with opened(path, BytesIO(content)) as image:
+        with open_image(path, BytesIO(content)) as image:
             mode = "RGBA" if header.transparent else "RGB"
             pixels = np.asarray(image.convert(mode))
         return cv2.cvtColor(pixels, cv2.COLOR_RGBA2BGRA if header.transparent else cv2.COLOR_RGB2BGR)

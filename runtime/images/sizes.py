@@ -1,14 +1,14 @@
 """Image sizes as commands are given them and as networks take them."""
 
 from ..errors import InputError
-from ..system.limits import SIDE_PIXELS, whole_number
+from ..system.limits import SIDE_PIXELS, parse_whole_number
 
 SHOWN = 40  # characters of an option that a message repeats
 
 
 def parse_size(text: str) -> tuple[int, int]:
     """The option --size, `HEIGHTxWIDTH`, as two numbers; raises InputError."""
-    sides = [whole_number(part) for part in text.lower().split("x")]
+    sides = [parse_whole_number(part) for part in text.lower().split("x")]
     if len(sides) != 2 or not all(sides):
         raise InputError(f"--size {text[:SHOWN]}: expected HEIGHTxWIDTH, such as 256x256")
     height, width = (side or 0 for side in sides)
@@ -20,7 +20,7 @@ def parse_size(text: str) -> tuple[int, int]:
     return height, width
 
 
-def size_fits(height: int, width: int, multiple: int) -> bool:
+def is_valid_size(height: int, width: int, multiple: int) -> bool:
     """Whether a network whose sizes go in steps of `multiple` takes this one."""
     return height % multiple == width % multiple == 0 and min(height, width) >= 2 * multiple
 
@@ -31,6 +31,6 @@ def nearest_size(aspect: float, area: float, multiple: int) -> tuple[int, int]:
     return height, width
 
 
-def size_rule(multiple: int) -> str:
-    """What `size_fits` asks, in words."""
+def describe_size_rule(multiple: int) -> str:
+    """What `is_valid_size` asks, in words."""
     return f"height and width must be multiples of {multiple} from {2 * multiple}"

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from ..errors import InputError
-from ..system.files import replacing
-from .writing import to_bytes
+from ..system.files import atomic_write
+from .colormaps import to_uint8
 
 if TYPE_CHECKING:
     from av.container import OutputContainer
@@ -49,12 +49,15 @@ def open_video(path: Path, width: int, height: int, fps: float) -> Iterator[Call
 
     padding = ((0, height % 2), (0, width % 2), (0, 0))
     try:
-        with replacing(path) as temporary, av.open(str(temporary), "w", format="mp4", options=FAST_START) as container:
+        with (
+            atomic_write(path) as temporary,
+            av.open(str(temporary), "w", format="mp4", options=FAST_START) as container,
+        ):
             rate = Fraction(fps).limit_denominator(LARGEST_DENOMINATOR)
             stream = _stream(container, rate, width + width % 2, height + height % 2)
 
             def add(rgb: np.ndarray) -> None:
-                pixels = np.pad(to_bytes(rgb), padding, mode="edge")
+                pixels = np.pad(to_uint8(rgb), padding, mode="edge")
                 frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
                 container.mux(stream.encode(frame.reformat(format=PIXELS, dst_colorspace="ITU709")))
 

@@ -17,13 +17,14 @@ from pathlib import Path
 import numpy as np
 
 from ..cameras.camera import Camera
-from ..geometry.consistency import AGREEMENT, seen_from
-from ..geometry.quaternions import quaternions_from_matrices
+from ..geometry.consistency import DEPTH_TOLERANCE, project_to_view
+from ..geometry.quaternions import matrices_to_quaternions
 from ..geometry.rigid import invert_rigid
-from ..images.writing import save_png, to_bytes
+from ..images.colormaps import to_uint8
+from ..images.png import save_png
 from ..splats.points import unproject
-from ..system.files import make_folder, replacing
-from ..views.batch import Views
+from ..system.files import atomic_write, make_folder
+from ..views.batch import ViewBatch
 from .predictor import Prediction
 
 PINHOLE = 1  # COLMAP's number of this camera model
@@ -45,7 +46,7 @@ def workspace_files(folder: Path, stems: Sequence[str]) -> list[Path]:
     return [*(folder / "images" / name for name in names), *maps, *(folder / name for name in listed)]
 
 
-def write_workspace(folder: Path, stems: Sequence[str], prediction: Prediction, views: Views) -> list[Path]:
+def write_workspace(folder: Path, stems: Sequence[str], prediction: Prediction, views: ViewBatch) -> list[Path]:
     """Write a dense workspace into an existing folder; the paths written.
 
     stems: the images' names without suffix, all different, [views]. views: what was predicted from; what was
@@ -71,7 +72,7 @@ def write_workspace(folder: Path, stems: Sequence[str], prediction: Prediction, 
     if views.offset.any():
         texts[folder / OFFSET_FILE] = " ".join(map(repr, views.offset.tolist())) + "\n"
     for path, text in texts.items():
-        with replacing(path) as temporary:
+        with atomic_write(path) as temporary:
             temporary.write_text(text)
     return [*written, *texts]
 
@@ -96,14 +97,14 @@ def normals_of(depth: np.ndarray, K: np.ndarray) -> np.ndarray:
 def _write_array(path: Path, values: np.ndarray) -> None:
     """COLMAP's form of a map [channels, height, width]: its size as text, then float32 values, channel by channel."""
     channels, height, width = values.shape
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_bytes(f"{width}&{height}&{channels}&".encode() + values.astype("<f4").tobytes())
 
 
 # ---- the sparse model
 
 
-def _write_sparse(folder: Path, names: Sequence[str], prediction: Prediction, views: Views) -> list[Path]:
+def _write_sparse(folder: Path, names: Sequence[str], prediction: Prediction, views: ViewBatch) -> list[Path]:
     """cameras.bin, images.bin and points3D.bin, one camera for each image; the paths written."""
     points, colours, sights = _sparse_points(prediction, views)
     # Every sight is an entry of its image's list, in which the points' tracks give their places.
@@ -122,23 +123,23 @@ def _write_sparse(folder: Path, names: Sequence[str], prediction: Prediction, vi
         ),
     }
     for name, data in content.items():
-        with replacing(folder / name) as temporary:
+        with atomic_write(folder / name) as temporary:
             temporary.write_bytes(data)
     return [folder / name for name in content]
 
 
-def _sparse_points(prediction: Prediction, views: Views) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _sparse_points(prediction: Prediction, views: ViewBatch) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Some pixels as points that views agree about: world [points, 3], RGB uint8 [points, 3], seen [points, views]."""
     depth, extrinsics, intrinsics = prediction.depth, views.extrinsics, views.intrinsics.astype(np.float64)
     count, height, width = depth.shape
     step = max(1, round((height * width / POINTS_A_VIEW) ** 0.5))
     rows, columns = (part.ravel() for part in np.mgrid[step // 2 : height : step, step // 2 : width : step])
     points = unproject(depth, extrinsics, intrinsics)[:, rows, columns].reshape(-1, 3)
-    colours = to_bytes(views.images[:, :, rows, columns]).transpose(0, 2, 1).reshape(-1, 3)
+    colours = to_uint8(views.images[:, :, rows, columns]).transpose(0, 2, 1).reshape(-1, 3)
     sights = np.zeros((len(points), count), bool)
     for view in range(count):
-        pixel, z, inside = seen_from(points, (height, width), extrinsics[view], intrinsics[view])
-        sights[:, view] = inside & (np.abs(depth[view].ravel()[pixel] - z) < AGREEMENT * z)
+        pixel, z, inside = project_to_view(points, (height, width), extrinsics[view], intrinsics[view])
+        sights[:, view] = inside & (np.abs(depth[view].ravel()[pixel] - z) < DEPTH_TOLERANCE * z)
     agreed = sights.sum(axis=1) >= FEWEST_SIGHTS
     return points[agreed], colours[agreed], sights[agreed]
 
@@ -156,7 +157,7 @@ def _camera_record(number: int, camera: Camera) -> bytes:
 def _image_record(number: int, name: str, camera: Camera, points: np.ndarray, seen: np.ndarray) -> bytes:
     """An image, its pose world-to-camera, and where it sees which of the points."""
     pose = invert_rigid(camera.extrinsics)
-    (quat,) = quaternions_from_matrices(pose[None, :3, :3])
+    (quat,) = matrices_to_quaternions(pose[None, :3, :3])
     local = points[seen] @ pose[:3, :3].T + pose[:3, 3]
     pixels = (local / local[:, 2:]) @ camera.K.T
     table = np.zeros(len(seen), [("x", "<f8"), ("y", "<f8"), ("point", "<i8")])

@@ -20,10 +20,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..images.resizing import cover
-from ..images.writing import save_depth_png
-from ..system.files import replacing
-from ..views.batch import Views
+from ..images.png import save_depth_png
+from ..images.resizing import cover_crop
+from ..system.files import atomic_write
+from ..views.batch import ViewBatch
 from .predictor import Prediction
 
 ENDINGS = (".png", ".npz")
@@ -34,7 +34,7 @@ def depth_map_files(folder: Path, stems: Sequence[str]) -> list[Path]:
     return [folder / (stem + ending) for stem in stems for ending in ENDINGS]
 
 
-def write_depth_maps(folder: Path, stems: Sequence[str], prediction: Prediction, views: Views) -> list[Path]:
+def write_depth_maps(folder: Path, stems: Sequence[str], prediction: Prediction, views: ViewBatch) -> list[Path]:
     """Write a picture and an archive of each view's depth into an existing folder; the paths written.
 
     stems: the files' names without suffix, all different, [views]. views: what was predicted from.
@@ -46,7 +46,7 @@ def write_depth_maps(folder: Path, stems: Sequence[str], prediction: Prediction,
         picture, archive = depth_map_files(folder, [stem])
         save_depth_png(picture, depth)
         near, far = camera.depth_range or (np.nan, np.nan)
-        with replacing(archive) as temporary:
+        with atomic_write(archive) as temporary:
             np.savez_compressed(
                 temporary,
                 depth=depth,
@@ -56,7 +56,7 @@ def write_depth_maps(folder: Path, stems: Sequence[str], prediction: Prediction,
                 far=far,
                 image=original.name,
                 image_size=(original.width, original.height),
-                crop=cover(original.width, original.height, camera.width, camera.height).matrix,
+                crop=cover_crop(original.width, original.height, camera.width, camera.height).matrix,
                 offset=views.offset,
             )
         written += [picture, archive]

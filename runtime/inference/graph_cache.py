@@ -19,7 +19,7 @@ from typing import TypeVar
 import onnxruntime
 
 from ..system.cache_folder import cache_folder
-from ..system.files import collect_abandoned, open_regular, scratch_folder
+from ..system.files import open_regular, remove_abandoned_folders, scratch_folder
 
 LAYOUT = 1
 SUFFIX = ".onnx"
@@ -87,7 +87,7 @@ def cache_entry(model: Path) -> CacheEntry | None:
             return None
         folder = cache_folder("graphs")
         folder.mkdir(parents=True, exist_ok=True)
-        collect_abandoned(folder)
+        remove_abandoned_folders(folder)
     except (OSError, RuntimeError):  # RuntimeError: there is no home folder
         return None
     made_for = [LAYOUT, onnxruntime.__version__, onnxruntime.get_build_info(), _processor()]

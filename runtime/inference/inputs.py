@@ -11,15 +11,15 @@ from ..cameras.camera import Camera
 from ..cameras.format_names import ESTIMATE, CameraFormat
 from ..cameras.io import read_cameras
 from ..errors import InputError
-from ..images.io import describe_unread, stem
-from ..images.resizing import cover
+from ..images.io import describe_unsupported, image_stem
+from ..images.resizing import cover_crop
 from ..images.sizes import nearest_size, parse_size
 from ..system.files import scratch_folder
 from ..system.progress import working
-from ..views.batch import Views, match, prepare
-from ..views.loader import Pair
-from ..views.selection import FEWEST_VIEWS
-from ..views.sources import find_photographs
+from ..views.batch import ViewBatch, build_view_batch, match_images_to_cameras
+from ..views.loader import ImageCameraPair
+from ..views.selection import MIN_VIEWS
+from ..views.sources import find_input_images
 from .predictor import Predictor
 
 DEFAULT_VIEWS = 2
@@ -50,7 +50,7 @@ class Inputs:
     all photographs. notes: lines for the user.
     """
 
-    views: Views
+    views: ViewBatch
     photographs: list[Path]
     cameras: list[Camera]
     notes: list[str]
@@ -61,43 +61,43 @@ def read_inputs(request: Request, predictor: Predictor) -> Inputs:
 
     Raises InputError for whatever cannot be used.
     """
-    notes = describe_unread(request.images)
+    notes = describe_unsupported(request.images)
     with scratch_folder() as folder:
         given = None if request.cameras == ESTIMATE else Path(request.cameras)
-        photographs = images = find_photographs(request.images, given, request.camera_format, folder)
+        photographs = images = find_input_images(request.images, given, request.camera_format, folder)
         decoded: dict[Path, np.ndarray] = {}
         if given is None:
             from ..sfm.estimate import estimate_cameras
 
             images = pick_frames(images, request.frames)
             wanted = _wanted(request, predictor, images)
-            left_out: list[str] = []
-            cameras = estimate_cameras(images, request.focal, None if request.frames else left_out, decoded)
-            notes += left_out
-            notes.append(_estimated(len(images) - len(left_out), cameras))
+            skipped: list[str] = []
+            cameras = estimate_cameras(images, request.focal, None if request.frames else skipped, decoded)
+            notes += skipped
+            notes.append(_estimated(len(images) - len(skipped), cameras))
             images = [Path(camera.name) for camera in cameras]
         else:
             with working("reading cameras"):
                 cameras = read_cameras(given, images, request.camera_format)
             images = pick_frames(images, request.frames)
             wanted = _wanted(request, predictor, images)
-        pairs = match(images, cameras)
+        pairs = match_images_to_cameras(images, cameras)
         if request.frames is None and len(cameras) > len(pairs):
             notes.append(f"{len(cameras) - len(pairs)} of {len(cameras)} cameras have no photograph among those given")
         own = [camera if path.parent != folder else replace(camera, name=path.name) for path, camera in pairs]
         height, width = parse_size(request.size) if request.size else predictor.size_for(own)
         count = min(wanted or len(pairs), len(pairs))
-        predictor.check_size(max(count, FEWEST_VIEWS), height, width)
+        predictor.check_size(max(count, MIN_VIEWS), height, width)
         with working("choosing and reading photographs"):
-            read: list[Pair] = [(decoded.get(path, path), camera) for path, camera in pairs]
-            views = prepare(read, count, height, width, leave_out_damaged=request.frames is None)
-    notes += [f"{line}; left out" for line in views.left_out]
+            read: list[ImageCameraPair] = [(decoded.get(path, path), camera) for path, camera in pairs]
+            views = build_view_batch(read, count, height, width, skip_damaged=request.frames is None)
+    notes += [f"{line}; left out" for line in views.skipped]
     if request.views and request.views > len(pairs):
         notes.append(f"--views {request.views}: all {len(pairs)} photographs used; there are no more with a camera")
     notes += _cut(views.cameras[0], height, width, predictor)
-    if views.choice:
+    if views.selection_reason:
         notes.append(
-            f"{count} of {len(pairs)} photographs used: {', '.join(views.names)}; {views.choice} "
+            f"{count} of {len(pairs)} photographs used: {', '.join(views.names)}; {views.selection_reason} "
             "(--views for more, --frames to choose)"
         )
     return Inputs(views, photographs, own, notes)
@@ -113,7 +113,7 @@ def pick_frames(images: Sequence[Path], frames: str | None) -> list[Path]:
         return list(images)
     picked = []
     for word in (word.strip() for word in frames.split(",")):
-        named = [image for image in images if word in (image.name, stem(image))]
+        named = [image for image in images if word in (image.name, image_stem(image))]
         chosen = named or [images[number] for number in _numbers(word, len(images))]
         if len(named) > 1 or not chosen:
             problem = f"{len(named)} of the {len(images)} images are called so" if named else "no image is called so"
@@ -147,7 +147,7 @@ def _wanted(request: Request, predictor: Predictor, picked: Sequence[Path]) -> i
 
 def _cut(camera: Camera, height: int, width: int, predictor: Predictor) -> list[str]:
     """A line that tells of the part of the photographs that is cut off, where that is much, and of a size without."""
-    crop = cover(camera.width, camera.height, width, height)
+    crop = cover_crop(camera.width, camera.height, width, height)
     share = width * height / (crop.width * crop.height)
     if share >= MUCH:
         return []
@@ -158,7 +158,7 @@ def _cut(camera: Camera, height: int, width: int, predictor: Predictor) -> list[
 
 
 def _estimated(photographs: int, cameras: Sequence[Camera]) -> str:
-    by = "OpenCV" if photographs == FEWEST_VIEWS else "COLMAP's mapper"
+    by = "OpenCV" if photographs == MIN_VIEWS else "COLMAP's mapper"
     left = f", {photographs - len(cameras)} could not be placed" if len(cameras) < photographs else ""
     return (
         f"cameras of {len(cameras)} photographs estimated by {by}{left}; the first is the world's origin, and the unit "

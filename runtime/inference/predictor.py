@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from ..cameras.camera import Camera
-from ..errors import InputError, located
-from ..images.arrays import eight_bit_image
-from ..images.sizes import size_fits, size_rule
+from ..errors import InputError, error_context
+from ..images.arrays import as_uint8_image
+from ..images.sizes import describe_size_rule, is_valid_size
 from ..splats.gaussians import Gaussians
-from ..views.batch import Views, check_views, prepare
-from ..views.depth_range import DepthRange, find_depth_range
+from ..views.batch import ViewBatch, build_view_batch, check_view_arrays
+from ..views.depth_range import DepthRange, estimate_depth_range
 from .graph_check import check_file, check_fused, check_results, check_stage, promised
 from .metadata import INPUTS, ModelMetadata, StageFile, read_manifest, read_metadata
 from .normalization import SceneNormalization
@@ -95,13 +95,13 @@ class Predictor:
         height, width = size or self.size_for(cameras)
         self.check_size(len(images), height, width)
         given = [
-            (eight_bit_image(image, camera.name) if isinstance(image, np.ndarray) else image, camera)
+            (as_uint8_image(image, camera.name) if isinstance(image, np.ndarray) else image, camera)
             for image, camera in zip(images, cameras, strict=True)
         ]
-        return self.predict_views(prepare(given, None, height, width), near, far)
+        return self.predict_views(build_view_batch(given, None, height, width), near, far)
 
-    def predict_views(self, views: Views, near: float | None = None, far: float | None = None) -> Prediction:
-        """Predict depth and Gaussians from views as `prepare` makes them.
+    def predict_views(self, views: ViewBatch, near: float | None = None, far: float | None = None) -> Prediction:
+        """Predict depth and Gaussians from views as `build_view_batch` makes them.
 
         near, far: scene units; as `depth_range` finds them where not given.
         Raises InputError for anything the model cannot take.
@@ -109,14 +109,14 @@ class Predictor:
         span = self.depth_range(views, near, far)
         return self._predict(views.images, views.extrinsics, views.intrinsics, span.near, span.far, views.names)
 
-    def depth_range(self, views: Views, near: float | None = None, far: float | None = None) -> DepthRange:
+    def depth_range(self, views: ViewBatch, near: float | None = None, far: float | None = None) -> DepthRange:
         """Near and far for these views, and where they come from; what is given stays.
 
         Raises InputError if near is not before far.
         """
         trained = self.metadata.near, self.metadata.far
-        return find_depth_range(
-            views.images, views.extrinsics, views.intrinsics, views.cameras, trained, near, far, views.samples
+        return estimate_depth_range(
+            views.images, views.extrinsics, views.intrinsics, views.cameras, trained, near, far, views.feature_images
         )
 
     def predict_arrays(
@@ -138,14 +138,14 @@ class Predictor:
         result, in that unit.
         Raises InputError for anything the model cannot take.
         """
-        check_views(images, extrinsics, intrinsics, near, far)
+        check_view_arrays(images, extrinsics, intrinsics, near, far)
         self.check_size(len(images), *np.shape(images)[2:])
         arrays = np.asarray(images), np.asarray(extrinsics), np.asarray(intrinsics)
         if near is None or far is None:
             trained = self.metadata.near, self.metadata.far
             nearest = None if near is None else float(np.min(near))
             farthest = None if far is None else float(np.max(far))
-            span = find_depth_range(*arrays, (), trained, near=nearest, far=farthest)
+            span = estimate_depth_range(*arrays, (), trained, near=nearest, far=farthest)
             near, far = span.near if near is None else near, span.far if far is None else far
         return self._predict(*arrays, near, far, [f"view {index}" for index in range(len(images))])
 
@@ -159,7 +159,7 @@ class Predictor:
         names: Sequence[str],
     ) -> Prediction:
         """`predict_arrays`, with the names of the views."""
-        check_views(images, extrinsics, intrinsics, near, far)
+        check_view_arrays(images, extrinsics, intrinsics, near, far)
         views, _, height, width = images.shape
         self.check_size(views, height, width)
         nearest, farthest = (np.full(views, depth, np.float64) for depth in (near, far))
@@ -234,8 +234,8 @@ class Predictor:
                 f"{self.path}: was exported for {own.height}x{own.width} and got {height}x{width}; "
                 f"use --size {own.height}x{own.width}, or export without --size"
             )
-        if not size_fits(height, width, own.size_multiple):
-            rule = size_rule(own.size_multiple)
+        if not is_valid_size(height, width, own.size_multiple):
+            rule = describe_size_rule(own.size_multiple)
             raise InputError(f"{self.path}: cannot take images of {height}x{width}; {rule}")
 
     def _run(self, values: dict[str, np.ndarray], frame: SceneNormalization) -> Prediction:
@@ -244,11 +244,11 @@ class Predictor:
         limit_s = run_limit_s(views * height * width)
         for (stage, session), keep in zip(self._stages, self._keep, strict=True):
             started = time.perf_counter()
-            with located(str(self.path) if stage.name == FUSED else f"{self.path}: stage {stage.name}"):
+            with error_context(str(self.path) if stage.name == FUSED else f"{self.path}: stage {stage.name}"):
                 values.update(run_session(session, values, stage.outputs, limit_s))
             seconds[stage.name] = time.perf_counter() - started
             values = {name: value for name, value in values.items() if name in keep}
-        with located(str(self.path)):
+        with error_context(str(self.path)):
             check_results(values, views, height, width, self.metadata)
         gaussians = None
         if self.metadata.gaussians:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..geometry.quaternions import rotation_matrices
+from ..geometry.quaternions import quaternions_to_matrices
 from ..geometry.sh import sh_basis
 from .types import (
     EPS2D,
@@ -59,7 +59,7 @@ def _ellipses(points: np.ndarray, gaussians: Scene, camera: View) -> Splats:
     to_camera = camera.viewmat[:3, :3]
     jacobian_x = (fx / z)[:, None] * (to_camera[0] - across[:, None] * to_camera[2])  # [splats, 3]
     jacobian_y = (fy / z)[:, None] * (to_camera[1] - down[:, None] * to_camera[2])
-    axes = rotation_matrices(gaussians.quats) * gaussians.scales[:, None, :]  # [splats, 3, 3], as columns, scaled
+    axes = quaternions_to_matrices(gaussians.quats) * gaussians.scales[:, None, :]  # [splats, 3, 3], as columns, scaled
     half_x = np.einsum("ni,nij->nj", jacobian_x, axes)
     half_y = np.einsum("ni,nij->nj", jacobian_y, axes)
     x_variance = np.einsum("ni,ni->n", half_x, half_x) + EPS2D

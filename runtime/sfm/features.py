@@ -19,29 +19,29 @@ TINY = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """places: pixels [features, 2]. descriptors: roots of SIFT's shares, of length 1, float32 [features, 128]."""
+    """keypoints: pixels [features, 2]. descriptors: roots of SIFT's shares, of length 1, float32 [features, 128]."""
 
-    places: np.ndarray
+    keypoints: np.ndarray
     descriptors: np.ndarray
 
 
-def find_features(image: np.ndarray, most: int = MOST_FEATURES) -> Features:
+def extract_features(image: np.ndarray, most: int = MOST_FEATURES) -> Features:
     """SIFT features of a picture, uint8 RGB [height, width, 3] or grey [height, width]; maybe none."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
     # Without the precise upscale, OpenCV's keypoints lie a quarter of a pixel too far to the right and down.
     sift = cv2.SIFT.create(most, contrastThreshold=CONTRAST, enable_precise_upscale=True)
-    keypoints, descriptors = sift.detectAndCompute(grey, None)
+    found, descriptors = sift.detectAndCompute(grey, None)
     if descriptors is None:
         return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
-    places = np.array([keypoint.pt for keypoint in keypoints]) + HALF_PIXEL
+    keypoints = np.array([keypoint.pt for keypoint in found]) + HALF_PIXEL
     # Distances between square roots of SIFT's histograms tell matches apart better (RootSIFT).
     shares = descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), TINY)
-    return Features(places, np.sqrt(shares).astype(np.float32))
+    return Features(keypoints, np.sqrt(shares).astype(np.float32))
 
 
 def match_features(first: Features, second: Features) -> np.ndarray:
     """Pairs of indices [matches, 2]: features that are each other's nearest, clearly nearer than the next."""
-    if min(len(first.places), len(second.places)) < 2:
+    if min(len(first.keypoints), len(second.keypoints)) < 2:
         return np.zeros((0, 2), int)
     # Descriptors have length 1: one minus the likeness is half the squared distance.
     likeness = first.descriptors @ second.descriptors.T  # [first, second]
@@ -54,12 +54,12 @@ def match_features(first: Features, second: Features) -> np.ndarray:
     return np.stack([rows, forth], axis=1)[good]
 
 
-def rays_of(places: np.ndarray, K: np.ndarray) -> np.ndarray:
-    """Places [points, 2] in a picture of a pinhole camera K [3, 3] as rays [points, 2]."""
-    return (places - K[:2, 2]) / np.diag(K)[:2]
+def normalize_points(keypoints: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """Points [points, 2] in a picture of a pinhole camera K [3, 3] as rays [points, 2]."""
+    return (keypoints - K[:2, 2]) / np.diag(K)[:2]
 
 
-def epipolar_error(
+def sampson_distance(
     first: np.ndarray, second: np.ndarray, second_from_first: np.ndarray, signed: bool = False
 ) -> np.ndarray:
     """How far two rays, both [points, 2], are from meeting: Sampson's distance [points], on the plane z = 1.
@@ -96,7 +96,7 @@ def triangulate(first: np.ndarray, second: np.ndarray, second_from_first: np.nda
     return (s[:, None] * a + centre + t[:, None] * b) / 2
 
 
-def parallax(points: np.ndarray, centre: np.ndarray) -> np.ndarray:
+def parallax_angles(points: np.ndarray, centre: np.ndarray) -> np.ndarray:
     """The angle in degrees [points] between the sights of points [points, 3] from the origin and from `centre` [3]."""
     other = points - centre
     cross = np.linalg.norm(np.cross(points, other), axis=1)

@@ -1,4 +1,4 @@
-"""More than two photographs without cameras: our features and matches, COLMAP's mapper (pycolmap, extra `colmap`)."""
+"""More than two images without cameras: our features and matches, COLMAP's mapper (pycolmap, extra `colmap`)."""
 
 import importlib.util
 from collections.abc import Sequence
@@ -18,29 +18,28 @@ from .features import match_features
 if TYPE_CHECKING:
     import pycolmap
 
-    from .estimate import Photograph
+    from .estimate import UncalibratedImage
 
 MODEL = "SIMPLE_RADIAL"
 USUAL_FOCAL = 1.0  # in longer sides of the picture: where the search for the focal length starts
-ALL_PAIRS = 20  # up to so many photographs each is matched with each, above with those next in order
+ALL_PAIRS = 20  # up to so many images each is matched with each, above with those next in order
 NEXT = (1, 2, 3, 4, 6, 8, 12, 16)
 FEWEST_MATCHES = 30
 SEED = 0
 
 
-def check_mapper(photographs: int) -> None:
+def check_pycolmap(images: int) -> None:
     """Raise InputError where pycolmap is not installed."""
     if importlib.util.find_spec("pycolmap") is None:
         raise InputError(
-            f"--cameras estimate: {photographs} photographs need pycolmap ({INSTALL}); "
-            "without it, choose two with --frames"
+            f"--cameras estimate: {images} images need pycolmap ({INSTALL}); without it, choose two with --frames"
         )
 
 
-def place_photographs(photographs: "Sequence[Photograph]", refine_focal: bool) -> tuple[list[Camera], np.ndarray]:
-    """The cameras of the photographs that fit together, in any frame and unit, and the depths of what they see.
+def run_incremental_sfm(images: "Sequence[UncalibratedImage]", refine_focal: bool) -> tuple[list[Camera], np.ndarray]:
+    """The cameras of the images that fit together, in any frame and unit, and the depths of what they see.
 
-    refine_focal: the photographs' focal lengths, where known, are no more than a start.
+    refine_focal: the images' focal lengths, where known, are no more than a start.
     Raises InputError where nothing fits together.
     """
     import pycolmap
@@ -48,63 +47,63 @@ def place_photographs(photographs: "Sequence[Photograph]", refine_focal: bool) -
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     with scratch_folder() as folder:
         database_path = folder / "database.db"
-        _fill(database_path, photographs)
-        with working("placing photographs"):
+        _fill(database_path, images)
+        with working("placing images"):
             pycolmap.geometric_verification(database_path)
             models = pycolmap.incremental_mapping(database_path, folder, folder, _options(refine_focal))
     if not models:
         raise InputError(
-            f"--cameras estimate: the {len(photographs)} photographs do not fit together; give more of them, that "
+            f"--cameras estimate: the {len(images)} images do not fit together; give more of them, that "
             "overlap and show texture, taken from places a step apart"
         )
     best = max(models.values(), key=lambda model: model.num_reg_images())
-    path_of = {_name(index): photograph.path for index, photograph in enumerate(photographs)}
-    cameras = [to_camera({**image, "name": str(path_of[image["name"]])}) for image in describe(best)]
+    path_of = {_name(index): image.path for index, image in enumerate(images)}
+    cameras = [to_camera({**found, "name": str(path_of[found["name"]])}) for found in describe(best)]
     return cameras, np.concatenate([observed_depths(best, image) for image in best.images.values() if image.has_pose])
 
 
 def _name(index: int) -> str:
-    """What a photograph is called in the database: any two photographs have different names, in order."""
+    """What an image is called in the database: any two images have different names, in order."""
     return f"{index:06}"
 
 
-def _fill(database_path: Path, photographs: "Sequence[Photograph]") -> None:
+def _fill(database_path: Path, images: "Sequence[UncalibratedImage]") -> None:
     """Write cameras, features and matches into a new database."""
     import pycolmap
 
     with pycolmap.Database.open(database_path) as database:
-        camera_of: dict[tuple[int, int, float | None], int] = {}
-        images = []
-        for index, photograph in enumerate(photographs):
-            kind = photograph.width, photograph.height, photograph.focal
-            if kind not in camera_of:
-                camera_of[kind] = _write_camera(database, photograph)
-            image = pycolmap.Image(name=_name(index), camera_id=camera_of[kind])
-            images.append(database.write_image(image))
-            database.write_keypoints(images[-1], photograph.features.places.astype(np.float32))
-        for i, j in progress(_pairs(len(photographs)), "matching photographs"):
-            matches = match_features(photographs[i].features, photographs[j].features)
+        camera_ids: dict[tuple[int, int, float | None], int] = {}  # images of equal size and focal length share one
+        image_ids = []
+        for index, image in enumerate(images):
+            key = image.width, image.height, image.focal
+            if key not in camera_ids:
+                camera_ids[key] = _write_camera(database, image)
+            record = pycolmap.Image(name=_name(index), camera_id=camera_ids[key])
+            image_ids.append(database.write_image(record))
+            database.write_keypoints(image_ids[-1], image.features.keypoints.astype(np.float32))
+        for i, j in progress(_pairs(len(images)), "matching images"):
+            matches = match_features(images[i].features, images[j].features)
             if len(matches) >= FEWEST_MATCHES:
-                database.write_matches(images[i], images[j], matches.astype(np.uint32))
+                database.write_matches(image_ids[i], image_ids[j], matches.astype(np.uint32))
 
 
-def _write_camera(database: "pycolmap.Database", photograph: "Photograph") -> int:
+def _write_camera(database: "pycolmap.Database", image: "UncalibratedImage") -> int:
     import pycolmap
 
-    width, height = photograph.width, photograph.height
-    focal = photograph.focal or USUAL_FOCAL * max(width, height)
+    width, height = image.width, image.height
+    focal = image.focal or USUAL_FOCAL * max(width, height)
     camera = pycolmap.Camera(model=MODEL, width=width, height=height, params=[focal, width / 2, height / 2, 0.0])
-    camera.has_prior_focal_length = photograph.focal is not None
+    camera.has_prior_focal_length = image.focal is not None
     return int(database.write_camera(camera))
 
 
 def _pairs(count: int) -> list[tuple[int, int]]:
-    """Which photographs to match."""
+    """Which images to match."""
     return [(i, j) for i, j in combinations(range(count), 2) if count <= ALL_PAIRS or j - i in NEXT]
 
 
 def _options(refine_focal: bool) -> "pycolmap.IncrementalPipelineOptions":
-    """The mapper's own, but for captures of few photographs taken close to each other."""
+    """The mapper's own, but for captures of few images taken close to each other."""
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()

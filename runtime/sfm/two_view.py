@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from .features import epipolar_error, parallax, triangulate
+from .features import parallax_angles, sampson_distance, triangulate
 
 # Estimators differ in where they go wrong; each gives a start, and the one that explains most is kept.
 ESTIMATORS = (cv2.USAC_MAGSAC, cv2.USAC_ACCURATE, cv2.RANSAC)
@@ -17,22 +17,22 @@ DAMPING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class TwoViews:
+class TwoViewGeometry:
     """Two cameras and what both see.
 
     second_from_first: takes points from the first camera's frame to the second's, [4, 4]; the baseline is 1.
-    fits: which of the given rays agree with it, and meet before both cameras, bool [rays].
+    inliers: which of the given rays agree with it, and meet before both cameras, bool [rays].
     points: where those meet, in the first camera's frame, [points, 3].
     parallax_deg: median angle between the two sights of a point.
     """
 
     second_from_first: np.ndarray
-    fits: np.ndarray
+    inliers: np.ndarray
     points: np.ndarray
     parallax_deg: float
 
 
-def estimate_pose(first: np.ndarray, second: np.ndarray, tolerance: float) -> TwoViews | None:
+def estimate_relative_pose(first: np.ndarray, second: np.ndarray, tolerance: float) -> TwoViewGeometry | None:
     """The relative pose that most rays agree with, or None where none is found.
 
     first, second: rays (x / z, y / z) [rays, 2] of the two cameras, some of them of different points.
@@ -45,11 +45,11 @@ def estimate_pose(first: np.ndarray, second: np.ndarray, tolerance: float) -> Tw
         return None
     refined = [_refine(first, second, pose, tolerance) for pose in starts]
     found = [_explain(first, second, pose, tolerance) for pose in refined]
-    return max(found, key=lambda views: int(views.fits.sum()))
+    return max(found, key=lambda views: int(views.inliers.sum()))
 
 
-def explained_by_turning(first: np.ndarray, second: np.ndarray, tolerance: float) -> float:
-    """The share of rays, as for `estimate_pose`, that a camera which only turned would have seen as well."""
+def rotation_only_inlier_ratio(first: np.ndarray, second: np.ndarray, tolerance: float) -> float:
+    """The share of rays, as for `estimate_relative_pose`, that a camera which only turned would have seen as well."""
     a, b = (np.hstack([rays, np.ones((len(rays), 1))]) for rays in (first, second))
     a, b = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (a, b))
     weights = np.ones(len(a))
@@ -75,7 +75,7 @@ def _starts(first: np.ndarray, second: np.ndarray, tolerance: float, method: int
         return []
     rotations = cv2.decomposeEssentialMat(essential[:3])
     candidates = [_pose(rotation, sign * rotations[2].ravel()) for rotation in rotations[:2] for sign in (1, -1)]
-    return [max(candidates, key=lambda pose: int(_explain(first, second, pose, tolerance).fits.sum()))]
+    return [max(candidates, key=lambda pose: int(_explain(first, second, pose, tolerance).inliers.sum()))]
 
 
 def _pose(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
@@ -84,22 +84,22 @@ def _pose(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
     return pose
 
 
-def _explain(first: np.ndarray, second: np.ndarray, pose: np.ndarray, tolerance: float) -> TwoViews:
+def _explain(first: np.ndarray, second: np.ndarray, pose: np.ndarray, tolerance: float) -> TwoViewGeometry:
     """What a pose makes of the rays."""
     points = triangulate(first, second, pose)
     there = points @ pose[:3, :3].T + pose[:3, 3]
-    fits = (epipolar_error(first, second, pose) < tolerance) & (points[:, 2] > 0) & (there[:, 2] > 0)
-    points = points[fits]
-    angles = parallax(points, -pose[:3, :3].T @ pose[:3, 3])
-    return TwoViews(pose, fits, points, float(np.median(angles)) if len(points) else 0.0)
+    inliers = (sampson_distance(first, second, pose) < tolerance) & (points[:, 2] > 0) & (there[:, 2] > 0)
+    points = points[inliers]
+    angles = parallax_angles(points, -pose[:3, :3].T @ pose[:3, 3])
+    return TwoViewGeometry(pose, inliers, points, float(np.median(angles)) if len(points) else 0.0)
 
 
 def _refine(first: np.ndarray, second: np.ndarray, pose: np.ndarray, tolerance: float) -> np.ndarray:
     """Move a pose to where the rays' errors are least, far-off ones counting ever less (Cauchy's weights)."""
     for _ in range(REFINEMENTS):
-        errors = epipolar_error(first, second, pose, signed=True)
+        errors = sampson_distance(first, second, pose, signed=True)
         steps = np.eye(5) * STEP
-        moved = [epipolar_error(first, second, _moved(pose, step), signed=True) for step in steps]
+        moved = [sampson_distance(first, second, _moved(pose, step), signed=True) for step in steps]
         slopes = (np.stack(moved, axis=1) - errors[:, None]) / STEP  # [rays, 5]
         weighted = slopes / (1 + (errors / tolerance) ** 2)[:, None]
         change = np.linalg.solve(weighted.T @ slopes + DAMPING * np.eye(5), -weighted.T @ errors)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from ..errors import InputError
-from ..geometry.consistency import confidence, depth_jumps
+from ..geometry.consistency import depth_jumps, multi_view_consistency
 from .gaussians import Gaussians
 from .merging import duplicates, merged
 
@@ -69,7 +69,7 @@ def filter_gaussians(
             case "max_depth_jump":
                 kept &= depth_jumps(depth) <= cleaning.max_depth_jump
             case "min_consistency":
-                kept &= confidence(means, depth, extrinsics, intrinsics) >= cleaning.min_consistency
+                kept &= multi_view_consistency(means, depth, extrinsics, intrinsics) >= cleaning.min_consistency
             case "merge_duplicates":
                 same_as = duplicates(means, depth, kept, extrinsics, intrinsics)
                 gaussians = merged(gaussians, same_as)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import InputError, refuse
+from ..errors import InputError, raise_input_error
 from ..geometry.sh import SH_0
 
 FLOAT32_BYTES, WITHOUT_SH = 4, 11  # numbers of a Gaussian beside its spherical harmonics
@@ -77,7 +77,7 @@ def check_finite(path: Path, gaussians: Gaussians) -> None:
         finite = np.isfinite(getattr(gaussians, field.name))
         if not finite.all():
             at = int(np.argwhere(~finite)[0, 0])
-            refuse(path, f"{field.name} of Gaussian {at} is not a finite number", "leave that Gaussian out")
+            raise_input_error(path, f"{field.name} of Gaussian {at} is not a finite number", "leave that Gaussian out")
 
 
 def with_colours(

@@ -4,8 +4,8 @@ from dataclasses import fields
 
 import numpy as np
 
-from ..geometry.consistency import seen_from
-from ..geometry.quaternions import quaternions_from_matrices, rotation_matrices
+from ..geometry.consistency import project_to_view
+from ..geometry.quaternions import matrices_to_quaternions, quaternions_to_matrices
 from .gaussians import Gaussians
 
 SAME_SURFACE = 0.01  # share of the depth by which two Gaussians may differ and still be taken for one
@@ -26,7 +26,7 @@ def duplicates(
         alone = np.flatnonzero(kept[view])
         for earlier in range(view):
             points = means[view].reshape(-1, 3)[alone]
-            pixel, z, seen = seen_from(points, (height, width), extrinsics[earlier], intrinsics[earlier])
+            pixel, z, seen = project_to_view(points, (height, width), extrinsics[earlier], intrinsics[earlier])
             surface = depth[earlier].ravel()[pixel]
             same = seen & kept[earlier][pixel] & (np.abs(z - surface) <= SAME_SURFACE * surface)
             same_as[view, alone[same]] = same_as[earlier, pixel[same]]
@@ -76,7 +76,7 @@ def merged(gaussians: Gaussians, same_as: np.ndarray) -> Gaussians:
 
 def _covariances(gaussians: Gaussians, members: np.ndarray) -> np.ndarray:
     """Covariances [members, 3, 3] of some of the Gaussians."""
-    axes = rotation_matrices(gaussians.quats[members]) * gaussians.scales[members][:, None, :]
+    axes = quaternions_to_matrices(gaussians.quats[members]) * gaussians.scales[members][:, None, :]
     return axes @ axes.swapaxes(1, 2)
 
 
@@ -84,4 +84,4 @@ def _ellipsoids(covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Scales [n, 3] and quaternions wxyz [n, 4] of covariances [n, 3, 3]."""
     variances, axes = np.linalg.eigh(covariances)
     axes[:, :, 2] *= np.linalg.det(axes)[:, None]  # a rotation, not a reflection
-    return np.sqrt(np.maximum(variances, 0)), quaternions_from_matrices(axes)
+    return np.sqrt(np.maximum(variances, 0)), matrices_to_quaternions(axes)

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ..images.writing import linear_colours, to_bytes
-from ..system.files import replacing
+from ..images.colormaps import srgb_to_linear, to_uint8
+from ..system.files import atomic_write
 from .axes import GLTF
 from .gaussians import Gaussians
 
@@ -44,7 +44,7 @@ def points_from_depth(
     extrinsics: camera-to-world, OpenCV axes, [views, 4, 4]. intrinsics: normalised by width and height, [views, 3, 3].
     """
     positions = unproject(depth, extrinsics, intrinsics)
-    colours = to_bytes(images).transpose(0, 2, 3, 1)
+    colours = to_uint8(images).transpose(0, 2, 3, 1)
     return PointCloud(positions.reshape(-1, 3).astype(np.float32), colours.reshape(-1, 3))
 
 
@@ -60,14 +60,14 @@ def unproject(depth: np.ndarray, extrinsics: np.ndarray, intrinsics: np.ndarray)
 
 def points_from_gaussians(gaussians: Gaussians) -> PointCloud:
     """The centre of every Gaussian, in the colour that it has from all sides."""
-    return PointCloud(gaussians.means, to_bytes(gaussians.colours))
+    return PointCloud(gaussians.means, to_uint8(gaussians.colours))
 
 
 def write_point_cloud(path: Path, cloud: PointCloud) -> None:
     """Write points in the form of the path's suffix; raises InputError if the file cannot be written."""
     import trimesh
 
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         if path.suffix.lower() == ".xyz":
             np.savetxt(temporary, np.column_stack([cloud.positions, cloud.colours]), "%.9g %.9g %.9g %d %d %d")
         else:
@@ -83,7 +83,7 @@ def write_mesh(path: Path, cloud: PointCloud, faces: np.ndarray) -> None:
     import trimesh
 
     positions, colours = _in_form(path, cloud)
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         _export(trimesh.Trimesh(positions, faces, vertex_colors=colours, process=False), temporary)
 
 
@@ -91,7 +91,7 @@ def _in_form(path: Path, cloud: PointCloud) -> tuple[np.ndarray, np.ndarray]:
     """Positions and colours as the path's format wants them."""
     if path.suffix.lower() != ".glb":
         return cloud.positions, cloud.colours
-    return cloud.positions * np.array(GLTF, np.float32), to_bytes(linear_colours(cloud.colours / 255))
+    return cloud.positions * np.array(GLTF, np.float32), to_uint8(srgb_to_linear(cloud.colours / 255))
 
 
 def _export(geometry: Any, temporary: Path) -> None:

@@ -11,7 +11,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
-from ..errors import InputError, refuse
+from ..errors import InputError, raise_input_error
 from .limits import EXPANSION
 
 try:
@@ -49,7 +49,7 @@ GUARD: ContextVar[WriteGuard | None] = ContextVar("GUARD", default=None)
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def atomic_write(path: Path) -> Iterator[Path]:
     """Yield a temporary path of the same name that replaces `path` once the block ends without an exception.
 
     A killed run leaves the old file or the new one, never half of one.
@@ -79,7 +79,7 @@ def scratch_folder(parent: Path | None = None) -> Iterator[Path]:
     Raises OSError if the folder cannot be made.
     """
     parent = Path(parent or tempfile.gettempdir())
-    collect_abandoned(parent)
+    remove_abandoned_folders(parent)
     folder, lock = _make_locked(parent)
     try:
         yield folder
@@ -89,7 +89,7 @@ def scratch_folder(parent: Path | None = None) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def collect_abandoned(parent: Path) -> None:
+def remove_abandoned_folders(parent: Path) -> None:
     """Remove the scratch folders that killed processes of this user left in `parent`; only when first asked to."""
     if fcntl is None or parent in _collected:
         return
@@ -126,7 +126,7 @@ def check_regular(path: Path) -> None:
     try:
         status = os.stat(path)
     except ValueError:  # NUL and lone surrogates
-        refuse(path, "is no name that a file can have", "give the path of a file")
+        raise_input_error(path, "is no name that a file can have", "give the path of a file")
     _check_kind(path, status)
 
 
@@ -140,14 +140,14 @@ def read_bytes(path: Path, expected: str, largest: int | None = None) -> bytes:
         with open_regular(path) as file:
             size = os.fstat(file.fileno()).st_size
             if largest is not None and size > largest:
-                refuse(path, f"has {size >> 20} MiB", f"expected {expected}")
+                raise_input_error(path, f"has {size >> 20} MiB", f"expected {expected}")
             content = file.read()
     except OSError as error:
-        refuse(path, f"cannot be read ({error.strerror})", f"expected {expected}")
+        raise_input_error(path, f"cannot be read ({error.strerror})", f"expected {expected}")
     except MemoryError:
-        refuse(path, f"has {size >> 20} MiB, more than memory has room for", f"expected {expected}")
+        raise_input_error(path, f"has {size >> 20} MiB, more than memory has room for", f"expected {expected}")
     if not content:
-        refuse(path, "is empty", f"expected {expected}")
+        raise_input_error(path, "is empty", f"expected {expected}")
     return content
 
 
@@ -181,7 +181,7 @@ def check_writable(folder: Path) -> None:
 def _check_kind(path: Path, status: os.stat_result) -> None:
     if not stat.S_ISREG(status.st_mode):
         kind = KINDS.get(stat.S_IFMT(status.st_mode), "no regular file")
-        refuse(path, f"is {kind}", "expected a regular file; save what it holds to one")
+        raise_input_error(path, f"is {kind}", "expected a regular file; save what it holds to one")
 
 
 def _make_locked(parent: Path) -> tuple[Path, int | None]:

@@ -29,7 +29,7 @@ class Limit:
         text = os.environ.get(self.variable, "")
         if not text:
             return self.default
-        number = whole_number(text)
+        number = parse_whole_number(text)
         if not number or number > LARGEST_LIMIT:
             raise InputError(f"{self.variable}={text}: expected a whole number of {self.unit}, 1 to {LARGEST_LIMIT}")
         return number
@@ -48,6 +48,6 @@ EXPANSION = Limit("IDESPLAT_MAX_EXPANSION", 64, "bytes in memory for one in the 
 SIDE_PIXELS = Limit("IDESPLAT_MAX_SIDE", 8192, "pixels")
 
 
-def whole_number(text: str) -> int | None:
+def parse_whole_number(text: str) -> int | None:
     """A number of at most MOST_DIGITS ASCII digits; None for anything else, such as `²`, a digit to `str.isdigit`."""
     return int(text) if text.isascii() and text.isdigit() and len(text) <= MOST_DIGITS else None

@@ -10,14 +10,14 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ..geometry.consistency import confidence
-from ..images.writing import depth_colours, inverse_depth_range, to_bytes
+from ..geometry.consistency import multi_view_consistency
+from ..images.colormaps import colormap_depth, inverse_depth_range, to_uint8
 from ..rendering.render import render_view
 from ..splats.gaussians import Gaussians
 from ..splats.points import points_from_depth
-from ..system.files import replacing
+from ..system.files import atomic_write
 from ..system.progress import progress
-from ..views.batch import Views
+from ..views.batch import ViewBatch
 
 JPEG_QUALITY = 92
 PAGE = Template("""<!DOCTYPE html>
@@ -58,7 +58,9 @@ $settings
 """)
 
 
-def write_report(path: Path, depth: np.ndarray, gaussians: Gaussians, views: Views, summary: dict[str, Any]) -> None:
+def write_report(
+    path: Path, depth: np.ndarray, gaussians: Gaussians, views: ViewBatch, summary: dict[str, Any]
+) -> None:
     """Write one HTML file that needs nothing else.
 
     depth: z-depth in scene units, [views, height, width]. gaussians: as they were written, so perhaps cleaned.
@@ -78,25 +80,27 @@ def write_report(path: Path, depth: np.ndarray, gaussians: Gaussians, views: Vie
         seconds=_table([(name, f"{value:.2f}") for name, value in seconds.items()]),
         settings=_table([*_flat(shown), ("files", "\n".join(files))]),
     )
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(page, encoding="utf-8", errors="replace")
 
 
-def _sections(depth: np.ndarray, gaussians: Gaussians, views: Views, ends: tuple[float, float]) -> Iterator[str]:
+def _sections(depth: np.ndarray, gaussians: Gaussians, views: ViewBatch, ends: tuple[float, float]) -> Iterator[str]:
     """For each view its photograph, what the splats show from there, depth and confidence."""
     height, width = depth.shape[1:]
     points = points_from_depth(depth, views.images, views.extrinsics, views.intrinsics).positions
-    confirmed = confidence(points.reshape(*depth.shape, 3), depth, views.extrinsics, views.intrinsics)
+    confirmed = multi_view_consistency(points.reshape(*depth.shape, 3), depth, views.extrinsics, views.intrinsics)
     Ks = views.intrinsics.astype(np.float64) * np.array([width, height, 1.0])[:, None]  # [views, 3, 3]
     for index in progress(range(len(depth)), "drawing the report"):
-        photograph = to_bytes(views.images[index].transpose(1, 2, 0))
-        drawn = to_bytes(render_view(gaussians, views.extrinsics[index], Ks[index], width, height).rgb)
+        photograph = to_uint8(views.images[index].transpose(1, 2, 0))
+        drawn = to_uint8(render_view(gaussians, views.extrinsics[index], Ks[index], width, height).rgb)
         low, middle, high = np.percentile(depth[index], (0, 50, 100))
-        colours = cv2.applyColorMap(to_bytes(confirmed[index]), cv2.COLORMAP_VIRIDIS)[..., ::-1]
+        colours = cv2.applyColorMap(to_uint8(confirmed[index]), cv2.COLORMAP_VIRIDIS)[..., ::-1]
         figures = [
             _figure(photograph, f"photograph, {width}x{height}", ".jpg"),
             _figure(drawn, f"drawn from the Gaussians: PSNR {cv2.PSNR(photograph, drawn):.2f} dB", ".jpg"),
-            _figure(to_bytes(depth_colours(depth[index], ends)), f"depth {low:.4g} to {high:.4g}, median {middle:.4g}"),
+            _figure(
+                to_uint8(colormap_depth(depth[index], ends)), f"depth {low:.4g} to {high:.4g}, median {middle:.4g}"
+            ),
             _figure(colours, f"confidence, mean {100 * confirmed[index].mean():.0f} %"),
         ]
         yield f"<section>\n<h3>{html.escape(views.names[index])}</h3>\n<div>{''.join(figures)}</div>\n</section>"

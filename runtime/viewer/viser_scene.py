@@ -18,8 +18,8 @@ import numpy as np
 
 from ..cameras.camera import Camera
 from ..errors import InputError
-from ..geometry.quaternions import quaternions_from_matrices, rotation_matrices
-from ..images.writing import to_bytes
+from ..geometry.quaternions import matrices_to_quaternions, quaternions_to_matrices
+from ..images.colormaps import to_uint8
 from ..rendering.cameras import focus, overview
 from ..splats.gaussians import Gaussians
 from .server import free_port, only_own_page
@@ -127,13 +127,13 @@ def _place_camera(server: "viser.ViserServer", first: Camera, cameras: Sequence[
 
 def _add_gaussians(server: "viser.ViserServer", gaussians: Gaussians, origin: np.ndarray, unit: float) -> None:
     """Without the part of their colours that changes with the direction, which the page cannot show."""
-    axes = rotation_matrices(gaussians.quats) * np.minimum(unit * gaussians.scales, LARGEST_SCALE)[:, None]
+    axes = quaternions_to_matrices(gaussians.quats) * np.minimum(unit * gaussians.scales, LARGEST_SCALE)[:, None]
     server.scene.add_gaussian_splats(
         "/Gaussians",
         centers=unit * (gaussians.means - origin),
         covariances=axes @ axes.transpose(0, 2, 1),
-        rgbs=to_bytes(gaussians.colours),
-        opacities=to_bytes(gaussians.opacities)[:, None],
+        rgbs=to_uint8(gaussians.colours),
+        opacities=to_uint8(gaussians.opacities)[:, None],
     )
 
 
@@ -167,7 +167,7 @@ def _add_frustum(server: "viser.ViserServer", index: int, view: Viewpoint) -> "v
         scale=scale,
         thickness=LINE,
         image=photograph,
-        wxyz=quaternions_from_matrices(camera.extrinsics[None, :3, :3])[0],
+        wxyz=matrices_to_quaternions(camera.extrinsics[None, :3, :3])[0],
         position=camera.extrinsics[:3, 3],
         cast_shadow=False,
         receive_shadow=False,
@@ -189,7 +189,7 @@ def _stand_there(clicked: Camera, cameras: Sequence[Camera], click: "viser.Scene
     with click.client.atomic():
         page = click.client.camera
         page.position = position
-        page.wxyz = quaternions_from_matrices(rotation[None])[0]
+        page.wxyz = matrices_to_quaternions(rotation[None])[0]
         page.look_at = position + DISTANCE * rotation[:, 2]
         page.fov = _field_of_view(camera)
 

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 
 from ..cameras.camera import Camera
-from ..errors import InputError, located
+from ..errors import InputError, error_context
 from ..geometry.intrinsics import check_intrinsics
-from ..geometry.rigid import rigid
+from ..geometry.rigid import check_rigid
 from ..images.header import DamagedImage
-from ..images.io import stem
-from .depth_range import neighbours, scene_distances
-from .loader import Pair, Sample, ViewLoader, load_view
-from .selection import FEWEST_VIEWS, choose_views, compare
+from ..images.io import image_stem
+from .depth_range import nearest_neighbor_pairs, scene_depths
+from .loader import FeatureImage, ImageCameraPair, ViewLoader
+from .selection import MIN_VIEWS, score_pairs, select_views
 
 EXAMPLES = 3  # names listed in a message
 
@@ -27,7 +27,7 @@ RANGE_SLACK = 1e-3  # how far resampling may have carried a pixel outside [0, 1]
 
 
 @dataclass(frozen=True, eq=False)
-class Views:
+class ViewBatch:
     """What the network takes, and the cameras it came from.
 
     names: file names of the pictures, [views].
@@ -35,10 +35,10 @@ class Views:
     extrinsics: float64, camera-to-world, OpenCV axes, in the world frame and unit that the user gave, [views, 4, 4].
     intrinsics: float32, row 0 divided by the width and row 1 by the height, [views, 3, 3].
     cameras: the same cameras undistorted, at the full size of the pictures, [views].
-    choice: how these views were chosen of more, in words; empty where there was no choice.
+    selection_reason: how these views were chosen of more, in words; empty where there was no selection.
     offset: what was subtracted from the user's world coordinates, float64 [3]; see `world_offset`.
-    samples: the images in which features are looked for, [views]; empty where cameras know the depths that they see.
-    left_out: what is wrong with images that could not be read and were left out, a line for each.
+    feature_images: the images for feature extraction, [views]; empty where every camera has a depth range.
+    skipped: what is wrong with images that could not be read and were left out, a line for each.
     """
 
     names: list[str]
@@ -46,13 +46,13 @@ class Views:
     extrinsics: np.ndarray
     intrinsics: np.ndarray
     cameras: list[Camera]
-    choice: str = ""
+    selection_reason: str = ""
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    samples: Sequence[Sample] = ()
-    left_out: Sequence[str] = ()
+    feature_images: Sequence[FeatureImage] = ()
+    skipped: Sequence[str] = ()
 
 
-def match(images: Sequence[Path], cameras: Sequence[Camera]) -> list[tuple[Path, Camera]]:
+def match_images_to_cameras(images: Sequence[Path], cameras: Sequence[Camera]) -> list[tuple[Path, Camera]]:
     """Give each picture the camera that names it, in the order of the pictures; cameras may be left over.
 
     Names are compared without suffix (a transforms.json often has none); of several such cameras the one with the same
@@ -61,8 +61,8 @@ def match(images: Sequence[Path], cameras: Sequence[Camera]) -> list[tuple[Path,
     """
     by_stem: dict[str, list[Camera]] = defaultdict(list)
     for camera in cameras:
-        by_stem[stem(_path(camera.name))].append(camera)
-    if not any(stem(image) in by_stem for image in images):
+        by_stem[image_stem(_path(camera.name))].append(camera)
+    if not any(image_stem(image) in by_stem for image in images):
         raise InputError(
             f"none of {len(images)} images ({_examples(images)}) is named by one of {len(cameras)} cameras "
             f"({_examples([camera.name for camera in cameras])}); give the images that the cameras were made for"
@@ -70,7 +70,7 @@ def match(images: Sequence[Path], cameras: Sequence[Camera]) -> list[tuple[Path,
     taken: dict[str, Path] = {}
     pairs = []
     for image in images:
-        candidates = by_stem.get(stem(image), [])
+        candidates = by_stem.get(image_stem(image), [])
         if not candidates:
             names = _examples([camera.name for camera in cameras])
             raise InputError(
@@ -84,63 +84,54 @@ def match(images: Sequence[Path], cameras: Sequence[Camera]) -> list[tuple[Path,
     return pairs
 
 
-def prepare(
-    pairs: Sequence[Pair], count: int | None, height: int, width: int, leave_out_damaged: bool = False
-) -> Views:
+def build_view_batch(
+    pairs: Sequence[ImageCameraPair], count: int | None, height: int, width: int, skip_damaged: bool = False
+) -> ViewBatch:
     """Take the pictures (only `count` well chosen ones, if given), undistort them and bring them to height x width.
 
     A picture is a file, or RGB [h, w, 3] in uint8, and is known by its camera's name. Each that is needed is read once.
-    leave_out_damaged: do without pictures that cannot be read, and name them in `Views.left_out`.
+    skip_damaged: do without pictures that cannot be read, and name them in `ViewBatch.skipped`.
 
     Raises InputError for fewer than two views, two cameras at the same pose, cameras without any baseline, a picture
     that cannot be read or has another size than its camera.
     """
     loader = ViewLoader(pairs, height, width)
     usable = list(range(len(pairs)))
-    left_out: list[str] = []
+    skipped: list[str] = []
     while True:
-        if len(usable) < FEWEST_VIEWS:
-            unread = f", {len(left_out)} cannot be read ({left_out[0]})" if left_out else ""
+        if len(usable) < MIN_VIEWS:
+            unread = f", {len(skipped)} cannot be read ({skipped[0]})" if skipped else ""
             image = "1 image" if len(usable) == 1 else f"{len(usable)} images"
-            raise InputError(f"{image} with a camera, expected at least {FEWEST_VIEWS}{unread}; add images")
+            raise InputError(f"{image} with a camera, expected at least {MIN_VIEWS}{unread}; add images")
         try:
-            return _prepared(loader, usable, count, left_out)
+            return _prepared(loader, usable, count, skipped)
         except DamagedImage as error:
             damaged = {index for index in usable if isinstance(pairs[index][0], Path) and pairs[index][0] == error.path}
-            if not leave_out_damaged or not damaged:
+            if not skip_damaged or not damaged:
                 raise
-            left_out.append(str(error))
+            skipped.append(str(error))
             usable = [index for index in usable if index not in damaged]
 
 
-def take(pair: Pair, height: int, width: int) -> tuple[np.ndarray, np.ndarray, Camera]:
-    """One picture, undistorted, [3, height, width] in [0, 1]; its normalised intrinsics [3, 3]; its ideal camera.
-
-    Raises InputError where it cannot be read or has another size than its camera.
-    """
-    loaded = load_view(pair, height, width)
-    return loaded.image, loaded.intrinsics, loaded.camera
-
-
-def _prepared(loader: ViewLoader, usable: Sequence[int], count: int | None, left_out: Sequence[str]) -> Views:
+def _prepared(loader: ViewLoader, usable: Sequence[int], count: int | None, skipped: Sequence[str]) -> ViewBatch:
     """The views of these images, or of `count` of them."""
-    choice = ""
+    selection_reason = ""
     if count is not None and count < len(usable):
-        usable, choice = _choose(loader, usable, count)
+        usable, selection_reason = _choose(loader, usable, count)
     cameras = [loader.pairs[index][1] for index in usable]
     extrinsics = np.stack([camera.extrinsics for camera in cameras])  # [views, 4, 4]
     _check_distinct(extrinsics, [camera.name for camera in cameras])
     loaded = [loader.load(index) for index in usable]
-    samples = [view.sample for view in loaded if view.sample is not None]
-    return Views(
+    feature_images = [view.sample for view in loaded if view.sample is not None]
+    return ViewBatch(
         [_path(camera.name).name for camera in cameras],
         np.stack([view.image for view in loaded]),
         extrinsics,
         np.stack([view.intrinsics for view in loaded]),
         [view.camera for view in loaded],
-        choice,
-        samples=samples if len(samples) == len(loaded) else (),
-        left_out=left_out,
+        selection_reason,
+        feature_images=feature_images if len(feature_images) == len(loaded) else (),
+        skipped=skipped,
     )
 
 
@@ -148,25 +139,25 @@ def _choose(loader: ViewLoader, usable: Sequence[int], count: int) -> tuple[list
     """The `count` best of these images with cameras, and why, in words.
 
     How far the scene is decides what is a good baseline: cameras may know, and otherwise a few images are matched.
-    Raises InputError as `choose_views` does, or where an image cannot be read.
+    Raises InputError as `select_views` does, or where an image cannot be read.
     """
     cameras = [loader.pairs[index][1] for index in usable]
-    distances, source = scene_distances(cameras, lambda index: loader.sample(usable[index]))
-    chosen = choose_views(cameras, count, distances)
-    between = compare([cameras[index] for index in chosen], distances[chosen])
-    i, j = np.array(neighbours(np.stack([cameras[index].extrinsics for index in chosen]))).T
+    distances, source = scene_depths(cameras, lambda index: loader.sample(usable[index]))
+    chosen = select_views(cameras, count, distances)
+    between = score_pairs([cameras[index] for index in chosen], distances[chosen])
+    i, j = np.array(nearest_neighbor_pairs(np.stack([cameras[index].extrinsics for index in chosen]))).T
     overlap, parallax = between.overlap[i, j], between.parallax[i, j]
     share = f"{100 * overlap.min():.0f} %" + (" or more" if len(i) > 1 else "")
     angles = " to ".join(dict.fromkeys(f"{angle:.1f}" for angle in (parallax.min(), parallax.max())))
-    choice = (
+    selection_reason = (
         f"neighbours share {share} of their view and stand {angles} degrees apart as seen from the scene, which is "
         f"{np.median(distances[chosen]):.3g} away by {source}"
     )
-    return [usable[index] for index in chosen], choice
+    return [usable[index] for index in chosen], selection_reason
 
 
-def check_views(images: Any, extrinsics: Any, intrinsics: Any, near: Any = None, far: Any = None) -> None:
-    """Check what the network is given, as `Views` describes it; near and far are one number or one for each view.
+def check_view_arrays(images: Any, extrinsics: Any, intrinsics: Any, near: Any = None, far: Any = None) -> None:
+    """Check what the network is given, as `ViewBatch` describes it; near and far are one number or one for each view.
 
     What is None of them is yet to be found.
 
@@ -177,15 +168,15 @@ def check_views(images: Any, extrinsics: Any, intrinsics: Any, near: Any = None,
     views = len(images)
     extrinsics = _floats(extrinsics, "extrinsics", "[views, 4, 4]", (views, 4, 4))
     intrinsics = _floats(intrinsics, "intrinsics", "[views, 3, 3]", (views, 3, 3))
-    if views < FEWEST_VIEWS:
-        raise InputError(f"images: {views} view given, expected at least {FEWEST_VIEWS}")
+    if views < MIN_VIEWS:
+        raise InputError(f"images: {views} view given, expected at least {MIN_VIEWS}")
     low, high = images.min(), images.max()
     if low < -RANGE_SLACK or high > 1 + RANGE_SLACK:
         raise InputError(f"images: values from {low:g} to {high:g}, expected 0 to 1; divide 8-bit pixels by 255")
     for index in range(views):
-        with located(f"extrinsics[{index}]"):
-            rigid(extrinsics[index])
-        with located(f"intrinsics[{index}], normalised (row 0 divided by the width, row 1 by the height)"):
+        with error_context(f"extrinsics[{index}]"):
+            check_rigid(extrinsics[index])
+        with error_context(f"intrinsics[{index}], normalised (row 0 divided by the width, row 1 by the height)"):
             check_intrinsics(intrinsics[index], 1, 1)
     _check_distinct(extrinsics, [f"view {index}" for index in range(views)])
     _check_range(near, far, views)

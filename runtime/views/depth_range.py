@@ -7,11 +7,19 @@ import numpy as np
 
 from ..cameras.camera import Camera
 from ..errors import InputError
-from ..geometry.depth_bounds import FEWEST_POINTS, range_of_depths
+from ..geometry.depth_bounds import MIN_POINTS, depth_bounds
 from ..geometry.rigid import invert_rigid
-from ..sfm.features import Features, epipolar_error, find_features, match_features, parallax, rays_of, triangulate
-from .loader import Sample
-from .selection import Scorer, guess_distances
+from ..sfm.features import (
+    Features,
+    extract_features,
+    match_features,
+    normalize_points,
+    parallax_angles,
+    sampson_distance,
+    triangulate,
+)
+from .loader import FeatureImage
+from .selection import PairScorer, guess_scene_depths
 
 SAMPLES = 3  # images looked at to find how far away a scene is, each with two others
 EPIPOLAR_ERROR = 1.5  # pixels
@@ -27,7 +35,7 @@ class DepthRange:
     source: str
 
 
-def find_depth_range(
+def estimate_depth_range(
     images: np.ndarray,  # [views, 3, height, width], RGB in [0, 1]
     extrinsics: np.ndarray,  # [views, 4, 4]
     intrinsics: np.ndarray,  # [views, 3, 3], normalised
@@ -35,11 +43,11 @@ def find_depth_range(
     trained: tuple[float, float],
     near: float | None = None,
     far: float | None = None,
-    samples: Sequence[Sample] = (),
+    feature_images: Sequence[FeatureImage] = (),
 ) -> DepthRange:
     """Near and far of these views; what is given stays.
 
-    samples: the views' images in which features are looked for, instead of the smaller `images`; none, or one for each.
+    feature_images: one for each view, or none; features are extracted from them instead of the smaller `images`.
     Ranges that the cameras know go first, then points matched between the views and triangulated. Where there are too
     few of them, near is the longest distance of a view from its nearest neighbour: what is closer is seen from
     directions so different that nothing would match; far is then as many times near as in `trained`, the near and far
@@ -48,7 +56,11 @@ def find_depth_range(
     """
     if near is not None and far is not None:
         return _checked(DepthRange(near, far, "given"))
-    found = _known(cameras) or _matched(images, extrinsics, intrinsics, samples) or _from_baseline(extrinsics, trained)
+    found = (
+        _known(cameras)
+        or _matched(images, extrinsics, intrinsics, feature_images)
+        or _from_baseline(extrinsics, trained)
+    )
     if near is not None:
         found = DepthRange(near, found.far, f"near given, far from {found.source}")
     elif far is not None:
@@ -75,34 +87,34 @@ def _known(cameras: Iterable[Camera]) -> DepthRange | None:
 
 
 def _matched(
-    images: np.ndarray, extrinsics: np.ndarray, intrinsics: np.ndarray, samples: Sequence[Sample]
+    images: np.ndarray, extrinsics: np.ndarray, intrinsics: np.ndarray, feature_images: Sequence[FeatureImage]
 ) -> DepthRange | None:
-    if samples:
-        features = [_inside(sample, normal) for sample, normal in zip(samples, intrinsics, strict=True)]
-        K = np.stack([sample.camera.K for sample in samples])
+    if feature_images:
+        features = [_inside(sample, normal) for sample, normal in zip(feature_images, intrinsics, strict=True)]
+        K = np.stack([sample.camera.K for sample in feature_images])
     else:
         height, width = images.shape[2:]
         pictures = np.rint(np.clip(images, 0, 1) * 255).astype(np.uint8).transpose(0, 2, 3, 1)
-        features = [find_features(np.ascontiguousarray(picture)) for picture in pictures]
+        features = [extract_features(np.ascontiguousarray(picture)) for picture in pictures]
         K = np.array([[width], [height], [1]]) * intrinsics.astype(np.float64)  # [views, 3, 3]
     depths = [np.zeros(0)]
-    for i, j in neighbours(extrinsics):
-        depths += depths_of_pair(features[i], features[j], K[i], K[j], invert_rigid(extrinsics[j]) @ extrinsics[i])
+    for i, j in nearest_neighbor_pairs(extrinsics):
+        depths += triangulated_depths(features[i], features[j], K[i], K[j], invert_rigid(extrinsics[j]) @ extrinsics[i])
     depth = np.concatenate(depths)  # two depths for each point
-    found = range_of_depths(depth)
+    found = depth_bounds(depth)
     return found and DepthRange(*found, f"{len(depth) // 2} points matched between the photographs")
 
 
-def _inside(sample: Sample, intrinsics: np.ndarray) -> Features:
+def _inside(sample: FeatureImage, intrinsics: np.ndarray) -> Features:
     """The features of a sample that lie in what the network takes of the image; its normalised intrinsics [3, 3]."""
     features = sample.features
-    rays = rays_of(features.places, sample.camera.K)
+    rays = normalize_points(features.keypoints, sample.camera.K)
     normal = rays * np.diag(intrinsics)[:2] + intrinsics[:2, 2]
     inside = ((normal >= 0) & (normal <= 1)).all(axis=1)
-    return Features(features.places[inside], features.descriptors[inside])
+    return Features(features.keypoints[inside], features.descriptors[inside])
 
 
-def depths_of_pair(
+def triangulated_depths(
     first: Features, second: Features, first_K: np.ndarray, second_K: np.ndarray, second_from_first: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Depths [points] in the first and in the second view of the points that both see, by their known cameras.
@@ -110,17 +122,20 @@ def depths_of_pair(
     Ks [3, 3] in pixels. second_from_first: takes points from the first camera's frame to the second's, [4, 4].
     """
     pairs = match_features(first, second)
-    a, b = rays_of(first.places[pairs[:, 0]], first_K), rays_of(second.places[pairs[:, 1]], second_K)
+    a, b = (
+        normalize_points(first.keypoints[pairs[:, 0]], first_K),
+        normalize_points(second.keypoints[pairs[:, 1]], second_K),
+    )
     pixel = 1 / np.sqrt(first_K[0, 0] * second_K[0, 0])
-    fits = epipolar_error(a, b, second_from_first) < EPIPOLAR_ERROR * pixel
-    points = triangulate(a[fits], b[fits], second_from_first)
+    inliers = sampson_distance(a, b, second_from_first) < EPIPOLAR_ERROR * pixel
+    points = triangulate(a[inliers], b[inliers], second_from_first)
     there = points @ second_from_first[:3, :3].T + second_from_first[:3, 3]
-    angle = parallax(points, invert_rigid(second_from_first)[:3, 3])
+    angle = parallax_angles(points, invert_rigid(second_from_first)[:3, 3])
     seen = (points[:, 2] > 0) & (there[:, 2] > 0) & (angle > SMALLEST_PARALLAX_DEG)
     return points[seen, 2], there[seen, 2]
 
 
-def neighbours(extrinsics: np.ndarray) -> list[tuple[int, int]]:
+def nearest_neighbor_pairs(extrinsics: np.ndarray) -> list[tuple[int, int]]:
     """Each view with the one nearest to it, pairs of indices, each pair once."""
     positions = extrinsics[:, :3, 3]
     distances = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
@@ -130,32 +145,32 @@ def neighbours(extrinsics: np.ndarray) -> list[tuple[int, int]]:
 
 def _from_baseline(extrinsics: np.ndarray, trained: tuple[float, float]) -> DepthRange:
     positions = extrinsics[:, :3, 3]
-    baseline = max(float(np.linalg.norm(positions[i] - positions[j])) for i, j in neighbours(extrinsics))
+    baseline = max(float(np.linalg.norm(positions[i] - positions[j])) for i, j in nearest_neighbor_pairs(extrinsics))
     return DepthRange(baseline, baseline * trained[1] / trained[0], "the baseline")
 
 
-def scene_distances(cameras: Sequence[Camera], sample: Callable[[int], Sample]) -> tuple[np.ndarray, str]:
+def scene_depths(cameras: Sequence[Camera], sample: Callable[[int], FeatureImage]) -> tuple[np.ndarray, str]:
     """How far from each camera the scene is, [cameras], and how that is known, in words.
 
     In the middle of the depths that the camera is known to see; where that is not known, at the median depth of points
-    matched between a few of the images; where none match, as `guess_distances` has it.
+    matched between a few of the images; where none match, as `guess_scene_depths` has it.
     sample: reads the image of the camera with this index; what it raises is raised.
     """
-    distances = guess_distances(cameras)
+    distances = guess_scene_depths(cameras)
     unknown = np.array([camera.depth_range is None for camera in cameras])
     if not unknown.any():
         return distances, "what the cameras are known to see"
     depths = np.concatenate([np.zeros(0), *_sampled_depths(cameras, distances, sample)])
-    if len(depths) < 2 * FEWEST_POINTS:
+    if len(depths) < 2 * MIN_POINTS:
         return distances, "the directions of the cameras"
     return np.where(unknown, np.median(depths), distances), "points matched between a few photographs"
 
 
 def _sampled_depths(
-    cameras: Sequence[Camera], distances: np.ndarray, sample: Callable[[int], Sample]
+    cameras: Sequence[Camera], distances: np.ndarray, sample: Callable[[int], FeatureImage]
 ) -> list[np.ndarray]:
     """Depths of points that a few images share with that of the best partner, and with the next one."""
-    scorer, everyone = Scorer(cameras, distances), np.arange(len(cameras))
+    scorer, everyone = PairScorer(cameras, distances), np.arange(len(cameras))
     depths: list[np.ndarray] = []
     for i in np.linspace(0, len(cameras) - 1, SAMPLES + 2)[1:-1].round().astype(int).tolist():
         best = int(scorer.score(np.full(len(cameras), i), everyone).cost.argmin())
@@ -163,5 +178,5 @@ def _sampled_depths(
             if i != j:
                 first, second = sample(i), sample(j)
                 between = invert_rigid(cameras[j].extrinsics) @ cameras[i].extrinsics
-                depths += depths_of_pair(first.features, second.features, first.camera.K, second.camera.K, between)
+                depths += triangulated_depths(first.features, second.features, first.camera.K, second.camera.K, between)
     return depths

@@ -8,19 +8,21 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ..cameras.camera import Camera, resized
+from ..cameras.camera import Camera, resize_camera
 from ..cameras.undistortion import undistort
-from ..errors import located
+from ..errors import error_context
 from ..images.io import load_image
-from ..images.resizing import fit
-from ..sfm.features import Features, find_features
+from ..images.resizing import resize_and_crop
+from ..sfm.features import Features, extract_features
 
-Pair = tuple[Path | np.ndarray, Camera]  # an image, as a file or as uint8 RGB [height, width, 3], and its camera
+ImageCameraPair = tuple[
+    Path | np.ndarray, Camera
+]  # an image, as a file or as uint8 RGB [height, width, 3], and its camera
 
 SAMPLE_SIDE = 640  # pixels of the longer side of the copy in which features are looked for
 
 
-class Sample:
+class FeatureImage:
     """A small copy of an image without distortion, in which features are looked for, once and when first asked for.
 
     camera: the copy's, without distortion.
@@ -30,13 +32,13 @@ class Sample:
         factor = min(1, SAMPLE_SIDE / max(image.shape[:2]))
         width, height = max(1, round(camera.width * factor)), max(1, round(camera.height * factor))
         small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-        small, self.camera = undistort(small, resized(camera, width, height))
+        small, self.camera = undistort(small, resize_camera(camera, width, height))
         self._grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
 
     @cached_property
     def features(self) -> Features:
         """What SIFT finds, in pixels of the copy."""
-        return find_features(self._grey)
+        return extract_features(self._grey)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +53,7 @@ class LoadedView:
     image: np.ndarray
     intrinsics: np.ndarray
     camera: Camera
-    sample: Sample | None
+    sample: FeatureImage | None
 
 
 class ViewLoader:
@@ -61,7 +63,7 @@ class ViewLoader:
     know the depths that they see, for which features are looked for.
     """
 
-    def __init__(self, pairs: Sequence[Pair], height: int, width: int) -> None:
+    def __init__(self, pairs: Sequence[ImageCameraPair], height: int, width: int) -> None:
         self.pairs, self.height, self.width = pairs, height, width
         self._sampled = any(camera.depth_range is None for _, camera in pairs)
         self._loaded: dict[int, LoadedView] = {}
@@ -72,22 +74,22 @@ class ViewLoader:
             self._loaded[index] = load_view(self.pairs[index], self.height, self.width, self._sampled)
         return self._loaded[index]
 
-    def sample(self, index: int) -> Sample:
+    def sample(self, index: int) -> FeatureImage:
         """The sample of one of the pairs, where one is taken; raises as `load`."""
         sample = self.load(index).sample
         assert sample is not None, "features are looked for where depths are not known"
         return sample
 
 
-def load_view(pair: Pair, height: int, width: int, sampled: bool = False) -> LoadedView:
+def load_view(pair: ImageCameraPair, height: int, width: int, sampled: bool = False) -> LoadedView:
     """Read one image, undistort it and bring it to height x width.
 
     Raises InputError where it cannot be read or has another size than its camera.
     """
     given, camera = pair
     image = given if isinstance(given, np.ndarray) else load_image(given)
-    with located(camera.name):
-        camera = resized(camera, image.shape[1], image.shape[0])
-    sample = Sample(image, camera) if sampled else None
+    with error_context(camera.name):
+        camera = resize_camera(camera, image.shape[1], image.shape[0])
+    sample = FeatureImage(image, camera) if sampled else None
     image, camera = undistort(image, camera)
-    return LoadedView(*fit(image, camera.K, height, width), camera, sample)
+    return LoadedView(*resize_and_crop(image, camera.K, height, width), camera, sample)

@@ -8,7 +8,7 @@ import numpy as np
 from ..cameras.camera import Camera
 from ..errors import InputError
 
-FEWEST_VIEWS = 2
+MIN_VIEWS = 2
 
 # The parallax of a good pair, seen from what both look at: wide enough to measure depth, narrow enough to match.
 GOOD_PARALLAX_DEG = 5.0
@@ -32,7 +32,7 @@ PARTNERS = 3  # cameras nearest to each such place whose pairs are scored
 
 
 @dataclass(frozen=True, eq=False)
-class Pairs:
+class PairwiseScores:
     """What two cameras have in common, for each pair; arrays of any one shape.
 
     overlap: share of what one sees that the other sees too, the smaller of both ways.
@@ -51,20 +51,20 @@ class Pairs:
         return np.round(cost, 6)  # equally good pairs are equal whatever the rounding of their poses
 
 
-def choose_views(cameras: Sequence[Camera], count: int, distances: np.ndarray | None = None) -> list[int]:
+def select_views(cameras: Sequence[Camera], count: int, distances: np.ndarray | None = None) -> list[int]:
     """Choose `count` cameras that see a common region with good baselines; indices in rising order.
 
     A pair is good when each sees what the other sees, and the parallax, seen from the scene, is near 5 degrees. The
     best pair comes first; then, again and again, the camera that makes the best pair with its nearest chosen one. Ties
-    go to the lower index. distances: how far from each camera the scene is, [cameras]; else from `guess_distances`.
+    go to the lower index. distances: how far from each camera the scene is, [cameras]; else from `guess_scene_depths`.
     Raises InputError if there are fewer cameras than asked for, or none sees what another sees from another place.
     """
     total = len(cameras)
-    if not FEWEST_VIEWS <= count <= total:
-        raise InputError(f"{count} views asked for, expected {FEWEST_VIEWS} to {total}, the number of images")
+    if not MIN_VIEWS <= count <= total:
+        raise InputError(f"{count} views asked for, expected {MIN_VIEWS} to {total}, the number of images")
     if count == total:
         return list(range(total))
-    scorer = Scorer(cameras, guess_distances(cameras) if distances is None else distances)
+    scorer = PairScorer(cameras, guess_scene_depths(cameras) if distances is None else distances)
     first, second = _pairs_to_score(scorer)
     cost = scorer.score(first, second).cost
     if not np.isfinite(cost).any():
@@ -75,18 +75,18 @@ def choose_views(cameras: Sequence[Camera], count: int, distances: np.ndarray | 
     return sorted(_more_views(scorer, [int(first[best]), int(second[best])], count))
 
 
-def compare(cameras: Sequence[Camera], distances: np.ndarray) -> Pairs:
+def score_pairs(cameras: Sequence[Camera], distances: np.ndarray) -> PairwiseScores:
     """Score each two cameras, [cameras, cameras], by points at the scene's distance, [cameras], from each."""
     total = len(cameras)
     first, second = np.triu_indices(total, 1)
-    pairs = Scorer(cameras, distances).score(first, second)
+    pairs = PairScorer(cameras, distances).score(first, second)
     overlap, parallax = np.eye(total), np.zeros((total, total))
     for whole, values in ((overlap, pairs.overlap), (parallax, pairs.parallax)):
         whole[first, second] = whole[second, first] = values
-    return Pairs(overlap, parallax)
+    return PairwiseScores(overlap, parallax)
 
 
-class Scorer:
+class PairScorer:
     """Scores pairs of cameras by points at the scene's distance, [cameras], from each."""
 
     def __init__(self, cameras: Sequence[Camera], distances: np.ndarray) -> None:
@@ -98,7 +98,7 @@ class Scorer:
         self.focals, self.principal = Ks[:, [0, 1], [0, 1]], Ks[:, :2, 2]
         self.points = self._seen()
 
-    def score(self, first: np.ndarray, second: np.ndarray) -> Pairs:
+    def score(self, first: np.ndarray, second: np.ndarray) -> PairwiseScores:
         """Score the pairs of cameras with these indices, [pairs] each."""
         overlap, parallax = np.zeros(len(first)), np.zeros(len(first))
         for start in range(0, len(first), PAIRS_AT_ONCE):
@@ -108,7 +108,7 @@ class Scorer:
             both = (there > 0) & (back > 0)
             overlap[part] = np.minimum(there, back)
             parallax[part] = np.degrees((forth + reverse) / 2) * both
-        return Pairs(overlap, parallax)
+        return PairwiseScores(overlap, parallax)
 
     def _seen(self) -> np.ndarray:
         """Points spread over each image, at the scene's distance, in the world, [3, cameras, GRID * GRID]."""
@@ -136,7 +136,7 @@ class Scorer:
         return inside.mean(axis=1), (inside * angle).sum(axis=1) / np.maximum(inside.sum(axis=1), 1)
 
 
-def _pairs_to_score(scorer: Scorer) -> tuple[np.ndarray, np.ndarray]:
+def _pairs_to_score(scorer: PairScorer) -> tuple[np.ndarray, np.ndarray]:
     """Indices of cameras among whose pairs the best one is looked for, in rising order, [pairs] each."""
     total = len(scorer.centres)
     if total <= EXHAUSTIVE:
@@ -149,7 +149,7 @@ def _pairs_to_score(scorer: Scorer) -> tuple[np.ndarray, np.ndarray]:
     return both[:, 0], both[:, 1]
 
 
-def _promising_pairs(scorer: Scorer) -> np.ndarray:
+def _promising_pairs(scorer: PairScorer) -> np.ndarray:
     """Pairs of cameras, [pairs, 2], which look at the same place from places that are a good baseline apart.
 
     A tree finds those nearest to where a good partner would stand and look.
@@ -177,7 +177,7 @@ def _promising_pairs(scorer: Scorer) -> np.ndarray:
     return found[found[:, 0] < found[:, 1]]
 
 
-def _more_views(scorer: Scorer, chosen: list[int], count: int) -> list[int]:
+def _more_views(scorer: PairScorer, chosen: list[int], count: int) -> list[int]:
     """To the chosen cameras, again and again, the one that makes the best pair with its nearest chosen one."""
     total = len(scorer.centres)
     nearest, cost = np.full(total, np.inf), np.full(total, np.inf)  # distance from the nearest chosen one, and its cost
@@ -194,7 +194,7 @@ def _more_views(scorer: Scorer, chosen: list[int], count: int) -> list[int]:
     return chosen
 
 
-def guess_distances(cameras: Sequence[Camera]) -> np.ndarray:
+def guess_scene_depths(cameras: Sequence[Camera]) -> np.ndarray:
     """How far from each camera the scene is, [cameras], without looking at the pictures.
 
     It is in the middle of the depths a camera is known to see. Where that is not known of a camera, the scene is where

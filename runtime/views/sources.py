@@ -5,16 +5,16 @@ from pathlib import Path
 
 from ..cameras.format_names import CameraFormat
 from ..cameras.formats.re10k import timestamps
-from ..cameras.image_files import IMAGE_FOLDERS, image_roots, picture_paths
-from ..cameras.io import read_cameras, recognise
+from ..cameras.image_files import IMAGE_FOLDERS, candidate_paths, image_roots
+from ..cameras.io import detect_format, read_cameras
 from ..errors import InputError
-from ..images import video
+from ..images import video_reader as video
 from ..images.io import find_images
 
 EXAMPLES = 3  # names in a message
 
 
-def find_photographs(
+def find_input_images(
     given: Sequence[Path], cameras: Path | None, camera_format: CameraFormat | None, folder: Path
 ) -> list[Path]:
     """The photographs that are given, or frames of a video, written to `folder`; where none are, those of the cameras.
@@ -30,8 +30,8 @@ def find_photographs(
     if len(given) > 1:
         raise InputError(f"{videos[0]}: a video and {len(given) - 1} other images given, expected it alone")
     if cameras is None:
-        return video.sample_frames(videos[0], folder)
-    return video.named_frames(videos[0], _names(cameras, camera_format), folder)
+        return video.extract_sharp_frames(videos[0], folder)
+    return video.extract_named_frames(videos[0], _names(cameras, camera_format), folder)
 
 
 def _named_photographs(cameras: Path | None, camera_format: CameraFormat | None) -> list[Path]:
@@ -53,11 +53,11 @@ def _named_photographs(cameras: Path | None, camera_format: CameraFormat | None)
 
 def _file(place: Path, name: str) -> Path | None:
     """The image of this name, with its suffix or without, in a folder."""
-    return next((path for path in picture_paths(place, name) if path.is_file()), None)
+    return next((path for path in candidate_paths(place, name) if path.is_file()), None)
 
 
 def _names(cameras: Path, camera_format: CameraFormat | None) -> list[str]:
     """The pictures that a file of cameras names, before any picture is there."""
-    if (camera_format or recognise(cameras)) is CameraFormat.RE10K:
+    if (camera_format or detect_format(cameras)) is CameraFormat.RE10K:
         return timestamps(cameras)
     return [camera.name for camera in read_cameras(cameras, (), camera_format)]

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..cameras.camera import relative_cameras
+from ..cameras.camera import offset_cameras
 from ..errors import InputError
-from ..geometry.rigid import FARTHEST
+from ..geometry.rigid import MAX_COORDINATE
 
 if TYPE_CHECKING:
-    from .batch import Views
+    from .batch import ViewBatch
 
 AUTO = "auto"
 # Of the smallest splats' size: as much may float32 move a mean without being seen. A splat of a pixel at the near plane
@@ -32,35 +32,37 @@ def parse_offset(text: str) -> np.ndarray | None:
         values = np.array([float(part) for part in text.split(",")])
     except ValueError:
         values = np.zeros(0)
-    if values.shape != (3,) or not (np.abs(values) <= FARTHEST).all():
-        raise InputError(f"--offset {text}: expected {AUTO}, or X,Y,Z in the cameras' unit, up to {FARTHEST:g} each")
+    if values.shape != (3,) or not (np.abs(values) <= MAX_COORDINATE).all():
+        raise InputError(
+            f"--offset {text}: expected {AUTO}, or X,Y,Z in the cameras' unit, up to {MAX_COORDINATE:g} each"
+        )
     return values
 
 
-def float32_step(views: "Views") -> float:
+def float32_step(views: "ViewBatch") -> float:
     """How far apart float32 can place means where these cameras stand, in world units."""
     return float(np.spacing(np.float32(np.abs(views.extrinsics[:, :3, 3]).max())))
 
 
-def loses_precision(views: "Views", near: float) -> bool:
+def loses_precision(views: "ViewBatch", near: float) -> bool:
     """Whether float32 moves means visibly; near: the nearest depth, in world units."""
     focal = (views.intrinsics[:, [0, 1], [0, 1]] * views.images.shape[:1:-1]).max()  # pixels
     return float32_step(views) > LARGEST_STEP * near / float(focal)
 
 
-def relative_views(views: "Views", offset: np.ndarray) -> "Views":
+def offset_views(views: "ViewBatch", offset: np.ndarray) -> "ViewBatch":
     """The views in a world whose origin is at `offset` [3] of theirs."""
     extrinsics = views.extrinsics.astype(np.float64)
     extrinsics[:, :3, 3] -= offset
     return replace(
         views,
         extrinsics=extrinsics,
-        cameras=relative_cameras(views.cameras, offset),
+        cameras=offset_cameras(views.cameras, offset),
         offset=views.offset + offset,
     )
 
 
-def with_offset(views: "Views", text: str | None, near: float) -> "tuple[Views, list[str]]":
+def apply_offset(views: "ViewBatch", text: str | None, near: float) -> "tuple[ViewBatch, list[str]]":
     """The views relative to what --offset asks for, and lines for the user: what was done, or should be.
 
     near: the nearest depth, in world units. Raises InputError as `parse_offset`.
@@ -70,7 +72,7 @@ def with_offset(views: "Views", text: str | None, near: float) -> "tuple[Views, 
         offset = parse_offset(text)
         if offset is None:
             offset = _middle(views, near) if loses_precision(views, near) else NO_OFFSET
-        views = relative_views(views, offset)
+        views = offset_views(views, offset)
         notes.append(
             f"coordinates are relative to {offset_text(offset)}, which the results record where their formats can"
             if offset.any()
@@ -90,7 +92,7 @@ def offset_text(offset: np.ndarray) -> str:
     return ",".join(f"{value:.17g}" if value != round(value) else f"{value:.0f}" for value in offset.tolist())
 
 
-def _middle(views: "Views", near: float) -> np.ndarray:
+def _middle(views: "ViewBatch", near: float) -> np.ndarray:
     """The middle of the cameras, rounded to the power of ten that is as large as the scene."""
     positions = views.extrinsics[:, :3, 3].astype(np.float64)
     extent = max(near, float(np.ptp(positions, axis=0).max()))

@@ -25,13 +25,13 @@ from idesplat.export.existing_exports import foreign_entries, is_our_graph
 from idesplat.model.checkpoint import CheckpointError, read_state_dict
 from idesplat.runtime.cameras.io import CameraFormat, read_cameras, write_cameras
 from idesplat.runtime.errors import InputError
-from idesplat.runtime.images.exif import exif_focal, given_focal
+from idesplat.runtime.images.exif import exif_focal, parse_focal
 from idesplat.runtime.images.header import image_size
 from idesplat.runtime.images.io import load_image
 from idesplat.runtime.images.sizes import parse_size
-from idesplat.runtime.images.video import sample_frames
+from idesplat.runtime.images.video_reader import extract_sharp_frames
 from idesplat.runtime.inference.metadata import MANIFEST_NAME, METADATA_KEY, StageFile, read_manifest, write_manifest
-from idesplat.runtime.system.written_files import add_to_record, read_record
+from idesplat.runtime.system.output_records import add_to_record, read_record
 from idesplat.runtime.views.depth_range import DepthRange
 from idesplat.runtime.views.world_offset import parse_offset
 from idesplat.tools.benchmark.report import Row, read_rows
@@ -95,7 +95,7 @@ def read_video(path: Path) -> None:
     folder = path.with_name("frames")
     folder.mkdir()
     try:
-        assert sample_frames(path, folder)
+        assert extract_sharp_frames(path, folder)
     finally:
         shutil.rmtree(folder)
 
@@ -301,7 +301,7 @@ def test_any_record_of_written_files(content: bytes, tmp_path: Path, monkeypatch
 PARSERS: dict[str, Callable[[str], Any]] = {
     "--size": parse_size,
     "--offset": parse_offset,
-    "--focal": lambda text: given_focal(text, 640, 480),
+    "--focal": lambda text: parse_focal(text, 640, 480),
     "--views": parse_view_counts,
 }
 

@@ -17,7 +17,7 @@ from conftest import USUAL_SIGINT
 from idesplat.runtime.inference.bundled_model import bundled_model
 from idesplat.runtime.splats.formats.ply import write_ply
 from idesplat.runtime.splats.gaussians import with_colours
-from idesplat.runtime.system.files import replacing, scratch_folder
+from idesplat.runtime.system.files import atomic_write, scratch_folder
 from idesplat.tools.evaluation.novel_views import Result, Target
 from idesplat.tools.evaluation.report import print_views
 
@@ -185,8 +185,8 @@ def test_telemetry_is_off_before_onnx_runtime_is_imported(module):
     assert done.stdout == "1\n", done.stderr
 
 
-LEFT = "import sys, time\nfrom idesplat.runtime.system.files import replacing\nfrom pathlib import Path\n"
-LEFT += "with replacing(Path(sys.argv[1])) as temporary:\n"
+LEFT = "import sys, time\nfrom idesplat.runtime.system.files import atomic_write\nfrom pathlib import Path\n"
+LEFT += "with atomic_write(Path(sys.argv[1])) as temporary:\n"
 LEFT += "    temporary.write_text('half')\n    print('writing', flush=True)\n    time.sleep(600)\n"
 
 
@@ -211,8 +211,8 @@ def test_what_killed_processes_left_is_collected(tmp_path):
 
 
 def write_elsewhere(folder: Path) -> None:
-    code = "import sys\nfrom idesplat.runtime.system.files import replacing\nfrom pathlib import Path\n"
-    code += "with replacing(Path(sys.argv[1])) as temporary:\n    temporary.write_text('whole')\n"
+    code = "import sys\nfrom idesplat.runtime.system.files import atomic_write\nfrom pathlib import Path\n"
+    code += "with atomic_write(Path(sys.argv[1])) as temporary:\n    temporary.write_text('whole')\n"
     subprocess.run([sys.executable, "-P", "-c", code, folder / "other"], check=True, timeout=60)
 
 
@@ -239,7 +239,7 @@ def test_a_folder_that_was_not_locked_yet_is_made_again(tmp_path, monkeypatch):
 
 def test_names_of_any_length_are_written(tmp_path):
     long = tmp_path / ("n" * 250 + ".ply")
-    with replacing(long) as temporary:
+    with atomic_write(long) as temporary:
         temporary.write_text("x")
     assert long.read_text() == "x"
 
@@ -249,11 +249,11 @@ def test_names_of_any_length_are_written(tmp_path):
 WAITING = """
 import sys, time
 from pathlib import Path
-from idesplat.runtime.system.files import replacing
+from idesplat.runtime.system.files import atomic_write
 from idesplat.runtime.cli.terminal import run
 
 def wait(out: Path) -> None:
-    with replacing(out) as temporary:
+    with atomic_write(out) as temporary:
         temporary.write_text("half")
         print("waiting", flush=True)
         time.sleep(600)
@@ -481,7 +481,7 @@ def test_readers_take_regular_files_alone(tmp_path, kind):
             "from idesplat.runtime.inference.metadata import read_manifest\n"
             "from idesplat.runtime.images.header import image_size\n"
             "from idesplat.runtime.images.io import load_image\n"
-            "from idesplat.runtime.images.video import sample_frames\n"
+            "from idesplat.runtime.images.video_reader import extract_sharp_frames\n"
             "from idesplat.tools.evaluation.captures import read_captures\n"
             "from idesplat.tools.training.log import TrainingLog\n"
             f"splats, cameras = {SPLATS!r}, {CAMERAS!r}\n"
@@ -492,7 +492,7 @@ def test_readers_take_regular_files_alone(tmp_path, kind):
             "tries += [(open_session, 'model.onnx'), (read_index, 'index.json'), (read_rows, 'rows.json')]\n"
             "tries += [(read_chunk, 'chunk.torch'), (image_size, 'else/a.png'), (load_image, 'else/a.png')]\n"
             "tries += [(lambda path: read_manifest(path.parent), 'else/manifest.json')]\n"
-            "tries += [(lambda path: sample_frames(path, Path()), 'else/clip.mp4')]\n"
+            "tries += [(lambda path: extract_sharp_frames(path, Path()), 'else/clip.mp4')]\n"
             "tries += [(lambda path: read_captures(path=path), 'else/captures.json')]\n"
             "tries += [(lambda path: TrainingLog(path, 0), 'else/log.jsonl')]\n"
             "names = ('else/a.ckpt', 'else/a.safetensors')\n"

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from idesplat.runtime.geometry.quaternions import unit_quaternions
+from idesplat.runtime.geometry.quaternions import normalize_quaternions
 from idesplat.runtime.splats.gaussians import Gaussians
 
 DATA = Path(__file__).parent.parent / "data" / "splats"
@@ -95,7 +95,7 @@ def assert_close(back: Gaussians, truth: Gaussians, bounds: Bounds, in_order: bo
 
 def ellipsoid_turns(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
     """How far rotations differ in a part of their quaternion, [n]; an ellipsoid's own half turns make no difference."""
-    ours, theirs = unit_quaternions(ours), unit_quaternions(theirs)
+    ours, theirs = normalize_quaternions(ours), normalize_quaternions(theirs)
     w, x, y, z = theirs.T
     same = [(w, x, y, z), (-x, w, z, -y), (-y, -z, w, x), (-z, y, -x, w)]
     differences = [np.abs(ours - sign * np.stack(quat, axis=1)).max(axis=1) for quat in same for sign in (1, -1)]

@@ -22,7 +22,7 @@ from ...runtime.cli.outputs import STANDARD_OUTPUT, Overwrite, guards_outputs, o
 from ...runtime.cli.terminal import literal, run, say, warn
 from ...runtime.errors import InputError, exit_on_input_error
 from ...runtime.images.sizes import parse_size
-from ...runtime.system.limits import whole_number
+from ...runtime.system.limits import parse_whole_number
 
 if TYPE_CHECKING:  # nothing heavy is loaded before there is something to measure
     from .report import Row
@@ -263,7 +263,7 @@ def _settings(threads: int | None, repeats: int, eager: bool) -> Settings:
 def _counts(text: str) -> list[int]:
     """The option --views, `2,4`, as numbers; raises InputError."""
     parts = text.split(",")
-    if not all((whole_number(part) or 0) >= FEWEST_VIEWS for part in parts):
+    if not all((parse_whole_number(part) or 0) >= FEWEST_VIEWS for part in parts):
         raise InputError(f"--views {text}: expected numbers from {FEWEST_VIEWS}, such as 2,4")
     return [int(part) for part in parts]
 

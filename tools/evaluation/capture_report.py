@@ -9,7 +9,7 @@ from typing import Any
 from rich.table import Table
 
 from ...runtime.cli.terminal import say
-from ...runtime.system.files import replacing
+from ...runtime.system.files import atomic_write
 from .capture_scores import PAIRS, CaptureScores, mean_of_captures
 from .captures import PAIR
 from .novel_views import MODEL, NEAREST, ORACLE_PLANE, Scores
@@ -69,7 +69,7 @@ def write_capture_results(
         ],
     }
     path = folder / RESULTS
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(content, indent=1) + "\n")
     return path
 

@@ -26,13 +26,14 @@ import numpy as np
 
 from ...runtime.cameras.camera import Camera
 from ...runtime.cameras.parsing import entries, read_json
-from ...runtime.errors import InputError, located
-from ...runtime.geometry.intrinsics import calibration
-from ...runtime.geometry.quaternions import rotation_matrices
+from ...runtime.errors import InputError, error_context
+from ...runtime.geometry.intrinsics import intrinsic_matrix
+from ...runtime.geometry.quaternions import quaternions_to_matrices
 from ...runtime.images.io import load_image
-from ...runtime.system.limits import whole_number
-from ...runtime.views.batch import Views, take
+from ...runtime.system.limits import parse_whole_number
+from ...runtime.views.batch import ViewBatch
 from ...runtime.views.depth_range import DepthRange
+from ...runtime.views.loader import load_view
 from .cases import EvalCase, PosedImages
 from .image_folders import valid_pixels
 
@@ -41,7 +42,7 @@ FORMAT, VERSION = "idesplat-captures", 1
 PAIR = 2  # context views of a triple
 MOST_VIEWS = 24  # of a path
 
-FindRange = Callable[[Views], DepthRange]
+FindRange = Callable[[ViewBatch], DepthRange]
 
 
 @dataclass(frozen=True)
@@ -123,9 +124,9 @@ class CaptureImages:
         name = f"{self.capture.name}-{len(context)}-{Path(context[0]).stem}"
         return EvalCase(name, self._posed(context), self._posed(targets), found.near, found.far)
 
-    def _views(self, names: Sequence[str]) -> Views:
+    def _views(self, names: Sequence[str]) -> ViewBatch:
         frames = [self._load(name) for name in names]
-        return Views(
+        return ViewBatch(
             list(names),
             np.stack([frame.image for frame in frames]),
             np.stack([frame.camera.extrinsics for frame in frames]),
@@ -141,15 +142,16 @@ class CaptureImages:
     def _load(self, name: str) -> LoadedFrame:
         if name not in self._loaded:
             image, camera = load_image(self.folder / name), self.capture.cameras[name]
-            fitted, intrinsics, ideal = take((image, camera), *self.size)
-            self._loaded[name] = LoadedFrame(fitted, intrinsics, ideal, valid_pixels(image, camera, *self.size))
+            view = load_view((image, camera), *self.size)
+            valid = valid_pixels(image, camera, *self.size)
+            self._loaded[name] = LoadedFrame(view.image, view.intrinsics, view.camera, valid)
         return self._loaded[name]
 
 
 def read_captures(names: Sequence[str] = (), path: Path | None = None) -> list[Capture]:
     """The captures of the package's file, or of another one, or those named of them, in order; raises InputError."""
     path = path or CAPTURES_FILE
-    with located(str(path)):
+    with error_context(str(path)):
         document = read_json(path)
         if document.get("format") != FORMAT or document.get("version") != VERSION:
             raise InputError(f'expected "format": "{FORMAT}" and "version": {VERSION}; update idesplat')
@@ -163,7 +165,7 @@ def read_captures(names: Sequence[str] = (), path: Path | None = None) -> list[C
 
 def parse_view_counts(text: str) -> list[int]:
     """The option --views, such as `2,6`: numbers of context views, in rising order; raises InputError."""
-    counts = [whole_number(word.strip()) or 0 for word in text.split(",")]
+    counts = [parse_whole_number(word.strip()) or 0 for word in text.split(",")]
     if not all(PAIR <= count <= MOST_VIEWS for count in counts):
         raise InputError(f"--views {text}: expected numbers from {PAIR} to {MOST_VIEWS} with commas, such as 2,6")
     return sorted(set(counts))
@@ -171,7 +173,7 @@ def parse_view_counts(text: str) -> list[int]:
 
 def _capture(entry: dict[str, Any]) -> Capture:
     texts = ("name", "kind", "content", "licence", "repository", "commit", "folder")
-    with located(str(entry.get("name"))):
+    with error_context(str(entry.get("name"))):
         try:
             cameras = {frame[0]: _camera(entry["lenses"], frame) for frame in entry["frames"]}
             triples = [Triple((first, second), target) for first, second, target in entry["triples"]]
@@ -194,11 +196,11 @@ def _camera(lenses: list[dict[str, Any]], frame: list[Any]) -> Camera:
     name, lens, quaternion, position, depth_range = frame
     fields = lenses[lens]
     extrinsics = np.eye(4)
-    extrinsics[:3, :3] = rotation_matrices(np.array([quaternion]))[0]
+    extrinsics[:3, :3] = quaternions_to_matrices(np.array([quaternion]))[0]
     extrinsics[:3, 3] = position
     distortion = fields["distortion"] and tuple(fields["distortion"])
     near_far = depth_range and tuple(depth_range)
-    K = calibration(*fields["K"])
+    K = intrinsic_matrix(*fields["K"])
     return Camera(name, fields["width"], fields["height"], K, extrinsics, distortion, depth_range=near_far)
 
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...runtime.geometry.consistency import seen_from
+from ...runtime.geometry.consistency import project_to_view
 from ...runtime.splats.points import unproject
 
 # Depths that differ by less than this share are of one surface.
@@ -89,6 +89,6 @@ def find_covisible(points: np.ndarray, depth: np.ndarray, views: PosedImages) ->
     """Whether some view sees points [..., 3], from the views' true z-depth [views, height, width]."""
     seen = np.zeros(points.shape[:-1], bool)
     for surface, extrinsics, intrinsics in zip(depth, views.extrinsics, views.intrinsics, strict=True):
-        pixel, z, inside = seen_from(points, surface.shape, extrinsics, intrinsics)
+        pixel, z, inside = project_to_view(points, surface.shape, extrinsics, intrinsics)
         seen |= inside & (np.abs(surface.ravel()[pixel] - z) < SAME_SURFACE * z)
     return seen

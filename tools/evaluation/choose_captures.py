@@ -18,21 +18,21 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from ...runtime.cameras.camera import Camera, resized
+from ...runtime.cameras.camera import Camera, resize_camera
 from ...runtime.cameras.io import read_cameras, write_cameras
 from ...runtime.cli.terminal import run, say
 from ...runtime.errors import InputError, exit_on_input_error
-from ...runtime.geometry.quaternions import quaternions_from_matrices
+from ...runtime.geometry.quaternions import matrices_to_quaternions
 from ...runtime.geometry.rigid import invert_rigid
 from ...runtime.images.io import SUFFIXES, load_image
 from ...runtime.sfm.estimate import estimate_cameras
-from ...runtime.sfm.features import epipolar_error, match_features, rays_of
-from ...runtime.system.files import make_folder, replacing
+from ...runtime.sfm.features import match_features, normalize_points, sampson_distance
+from ...runtime.system.files import atomic_write, make_folder
 from ...runtime.system.progress import progress
-from ...runtime.views.batch import match
-from ...runtime.views.depth_range import depths_of_pair, scene_distances
-from ...runtime.views.loader import Sample
-from ...runtime.views.selection import compare
+from ...runtime.views.batch import match_images_to_cameras
+from ...runtime.views.depth_range import scene_depths, triangulated_depths
+from ...runtime.views.loader import FeatureImage
+from ...runtime.views.selection import score_pairs
 from .captures import CAPTURES_FILE, FORMAT, MOST_VIEWS, VERSION
 from .checkouts import extract, fetch_checkout, list_folder
 
@@ -204,14 +204,14 @@ def choose_captures(
     for recipe in RECIPES:
         if not capture or recipe.name in capture:
             entries[recipe.name] = _choose(recipe, checkouts, work)
-            with replacing(CAPTURES_FILE) as temporary:
+            with atomic_write(CAPTURES_FILE) as temporary:
                 temporary.write_text(as_json([entries[name] for name in order if name in entries]))
     say(f"wrote {CAPTURES_FILE}: {len(entries)} captures")
 
 
 def _choose(recipe: Recipe, checkouts: Path, work: Path) -> dict[str, Any]:
     images, cameras = _frames(recipe, checkouts, make_folder(work / recipe.name))
-    pairs = match(images, cameras)
+    pairs = match_images_to_cameras(images, cameras)
     pairs = [(path, replace(camera, name=path.name)) for path, camera in pairs]
     survey = _kept_survey(work / recipe.name / "survey.npz", pairs)
     good = np.flatnonzero(survey.error < WORST_EPIPOLAR)
@@ -280,7 +280,7 @@ def _frames(recipe: Recipe, checkouts: Path, work: Path) -> tuple[list[Path], li
 def _kept_survey(path: Path, pairs: Sequence[tuple[Path, Camera]]) -> Survey:
     """What `_survey` finds, kept in a file."""
     if not path.exists():
-        with replacing(path) as temporary:
+        with atomic_write(path) as temporary:
             np.savez(temporary, **vars(_survey(pairs)))
     with np.load(path) as content:
         return Survey(**content)
@@ -290,8 +290,8 @@ def _survey(pairs: Sequence[tuple[Path, Camera]]) -> Survey:
     """Match each frame with its best neighbours."""
     cameras = [camera for _, camera in pairs]
     samples = [_sample(*pair) for pair in progress(pairs, "finding features")]
-    distances, _ = scene_distances(cameras, samples.__getitem__)
-    cost = compare(cameras, distances).cost
+    distances, _ = scene_depths(cameras, samples.__getitem__)
+    cost = score_pairs(cameras, distances).cost
     error, depth = np.full(len(pairs), np.inf), np.array(distances, float)
     for i in range(len(pairs)):
         partners = [int(j) for j in np.argsort(cost[i])[:PARTNERS] if np.isfinite(cost[i, j])]
@@ -302,25 +302,28 @@ def _survey(pairs: Sequence[tuple[Path, Camera]]) -> Survey:
             depth[i] = np.median(depths)
     places = np.stack([camera.extrinsics[:3, 3] for camera in cameras])
     apart = np.linalg.norm(places[:, None] - places[None], axis=-1)
-    return Survey(depth, error, compare(cameras, depth).overlap, apart / np.sqrt(depth[:, None] * depth[None]))
+    return Survey(depth, error, score_pairs(cameras, depth).overlap, apart / np.sqrt(depth[:, None] * depth[None]))
 
 
-def _sample(path: Path, camera: Camera) -> Sample:
+def _sample(path: Path, camera: Camera) -> FeatureImage:
     image = load_image(path)
-    return Sample(image, resized(camera, image.shape[1], image.shape[0]))
+    return FeatureImage(image, resize_camera(camera, image.shape[1], image.shape[0]))
 
 
-def _epipolar(first: Sample, second: Sample) -> tuple[float, np.ndarray]:
+def _epipolar(first: FeatureImage, second: FeatureImage) -> tuple[float, np.ndarray]:
     """Median epipolar distance of two frames' matches in pixels, and depths in the first frame."""
     a, b, first_camera, second_camera = first.features, second.features, first.camera, second.camera
     matches = match_features(a, b)
     if len(matches) < FEWEST_MATCHES:
         return np.inf, np.zeros(0)
     between = invert_rigid(second_camera.extrinsics) @ first_camera.extrinsics
-    rays = rays_of(a.places[matches[:, 0]], first_camera.K), rays_of(b.places[matches[:, 1]], second_camera.K)
+    rays = (
+        normalize_points(a.keypoints[matches[:, 0]], first_camera.K),
+        normalize_points(b.keypoints[matches[:, 1]], second_camera.K),
+    )
     focal = np.sqrt(first_camera.K[0, 0] * second_camera.K[0, 0])
-    error = float(np.median(epipolar_error(*rays, between)) * focal)
-    return error, depths_of_pair(a, b, first_camera.K, second_camera.K, between)[0]
+    error = float(np.median(sampson_distance(*rays, between)) * focal)
+    return error, triangulated_depths(a, b, first_camera.K, second_camera.K, between)[0]
 
 
 def _triple_costs(
@@ -413,7 +416,7 @@ def camera_entries(cameras: Sequence[Camera]) -> dict[str, Any]:
         lens = {"width": camera.width, "height": camera.height, "K": K, "distortion": distortion}
         if lens not in lenses:
             lenses.append(lens)
-        quaternion = quaternions_from_matrices(camera.extrinsics[None, :3, :3])[0]
+        quaternion = matrices_to_quaternions(camera.extrinsics[None, :3, :3])[0]
         numbers = [[round(float(value), DECIMALS) for value in part] for part in (quaternion, camera.extrinsics[:3, 3])]
         depth_range = camera.depth_range and [float(f"{depth:.6g}") for depth in camera.depth_range]
         frames.append([Path(camera.name).name, lenses.index(lens), *numbers, depth_range])

@@ -21,10 +21,10 @@ from typing import Any
 
 import numpy as np
 
-from ...runtime.errors import InputError, located
+from ...runtime.errors import InputError, error_context
 from ...runtime.geometry.intrinsics import check_intrinsics
 from ...runtime.geometry.rigid import invert_rigid
-from ...runtime.images.resizing import cover, fit
+from ...runtime.images.resizing import cover_crop, resize_and_crop
 from ...runtime.system.files import check_regular, read_bytes
 from .cases import EvalCase, PosedImages
 
@@ -163,7 +163,7 @@ def _check_scene(scene: dict[str, Any], where: str) -> None:
 def _posed(scene: dict[str, Any], frames: list[int], height: int, width: int) -> PosedImages:
     images, intrinsics, extrinsics = [], [], []
     for frame in frames:
-        with located(f"frame {frame}"):
+        with error_context(f"frame {frame}"):
             K, pose = _camera(scene["cameras"][frame].numpy().astype(np.float64))
             image, k = _fitted(_decoded(scene["images"][frame].numpy()), K, height, width)
         images.append(image)
@@ -197,12 +197,12 @@ def _decoded(content: np.ndarray) -> np.ndarray:
 def _fitted(image: np.ndarray, K: np.ndarray, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     """The image covering height x width, float32 [3, height, width], and its normalised intrinsics [3, 3].
 
-    The papers scale with Pillow's Lanczos filter, which is sharper than what `fit` does for images. On three views
-    of real images that alone cost a warped plane 0.3 to 0.6 dB.
+    The papers scale with Pillow's Lanczos filter, which is sharper than what `resize_and_crop` does for images. On
+    three views of real images that alone cost a warped plane 0.3 to 0.6 dB.
     """
     from PIL import Image
 
     full_height, full_width = image.shape[:2]
-    crop = cover(full_width, full_height, width, height)
+    crop = cover_crop(full_width, full_height, width, height)
     scaled = Image.fromarray(image).resize((crop.width, crop.height), Image.Resampling.LANCZOS)
-    return fit(np.asarray(scaled), np.diag([crop.width, crop.height, 1.0]) @ K, height, width)
+    return resize_and_crop(np.asarray(scaled), np.diag([crop.width, crop.height, 1.0]) @ K, height, width)

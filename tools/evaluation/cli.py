@@ -70,14 +70,14 @@ def scene(
         raise InputError("--views and --context: expected one of them; --context names the views that there are")
     from ...runtime.cameras.io import read_cameras
     from ...runtime.images.io import find_images
-    from ...runtime.views.batch import match
+    from ...runtime.views.batch import match_images_to_cameras
     from .image_folders import chosen_frames, load_case
     from .metrics import load_lpips
     from .novel_views import Evaluator, mean_of_views
     from .report import print_means, print_views
 
     found = find_images([images])
-    frames = match(found, read_cameras(cameras, found))
+    frames = match_images_to_cameras(found, read_cameras(cameras, found))
     predictor = _runner(model, out, [*found, *camera_files(cameras)])
     count = predictor.view_count(views, None, DEFAULT_VIEWS) or DEFAULT_VIEWS
     chosen = chosen_frames(frames, context or [], target or [], count, hold_out_every)
@@ -268,7 +268,7 @@ def _evaluate(
 
     skip: hears of a case that the model cannot take, and why; without it that is an error.
     """
-    from ...runtime.images.writing import save_png
+    from ...runtime.images.png import save_png
 
     results: list[Result] = []
     for case in progress(cases, "evaluating", total):
@@ -285,7 +285,7 @@ def _evaluate(
 
 
 def _save_strip(out: Path, name: str, strip: "np.ndarray") -> None:
-    from ...runtime.images.writing import save_png
+    from ...runtime.images.png import save_png
 
     save_png(out / f"{name}.png", strip)
 

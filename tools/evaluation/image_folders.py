@@ -8,14 +8,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ...runtime.cameras.camera import Camera, resized
-from ...runtime.cameras.undistortion import seen_by_lens
+from ...runtime.cameras.camera import Camera, resize_camera
+from ...runtime.cameras.undistortion import undistortion_valid_mask
 from ...runtime.errors import InputError
 from ...runtime.images.header import image_size
 from ...runtime.images.io import load_image
-from ...runtime.images.resizing import cover
+from ...runtime.images.resizing import cover_crop
 from ...runtime.system.files import check_regular
-from ...runtime.views.batch import Views, prepare
+from ...runtime.views.batch import ViewBatch, build_view_batch
 from ...runtime.views.depth_range import DepthRange
 from .cases import EvalCase, PosedImages
 
@@ -86,7 +86,7 @@ def load_case(
     context: Sequence[int],
     targets: Sequence[int],
     size: tuple[int, int],
-    find_range: Callable[[Views], DepthRange],
+    find_range: Callable[[ViewBatch], DepthRange],
     depth: Path | None = None,
 ) -> EvalCase:
     """The frames undistorted, resized and cropped as the network takes them, and which of their pixels are valid.
@@ -97,18 +97,18 @@ def load_case(
     Raises InputError for images, cameras and depth that cannot be used.
     """
     chosen = [frames[number] for number in (*context, *targets)]
-    views = prepare(chosen, None, *size)
+    views = build_view_batch(chosen, None, *size)
     valid = np.stack([valid_pixels(load_image(path), camera, *size) for path, camera in chosen])
     for name, seen in zip(views.names, valid, strict=True):
         if seen.mean() < LEAST_VALID:
             raise InputError(f"{name}: is black nearly everywhere, or its distortion wrong; expected a image")
 
-    def taken(part: slice) -> Views:
+    def taken(part: slice) -> ViewBatch:
         images, extrinsics, intrinsics = (field[part] for field in (views.images, views.extrinsics, views.intrinsics))
-        samples = views.samples[part]
-        return Views(views.names[part], images, extrinsics, intrinsics, views.cameras[part], samples=samples)
+        samples = views.feature_images[part]
+        return ViewBatch(views.names[part], images, extrinsics, intrinsics, views.cameras[part], feature_images=samples)
 
-    def posed(part: Views, valid: np.ndarray) -> PosedImages:
+    def posed(part: ViewBatch, valid: np.ndarray) -> PosedImages:
         return PosedImages(part.names, part.images, part.extrinsics, part.intrinsics, valid)
 
     count = len(context)
@@ -134,8 +134,8 @@ def valid_pixels(image: np.ndarray, camera: Camera, height: int, width: int) -> 
     if camera.distortion is None:
         seen = ~_black_border(image)
     else:
-        seen = seen_by_lens(resized(camera, image.shape[1], image.shape[0]))
-    crop = cover(image.shape[1], image.shape[0], width, height)
+        seen = undistortion_valid_mask(resize_camera(camera, image.shape[1], image.shape[0]))
+    crop = cover_crop(image.shape[1], image.shape[0], width, height)
     interpolation = cv2.INTER_AREA if crop.scale_x < 1 else cv2.INTER_LINEAR
     share = cv2.resize(seen.astype(np.float32), (crop.width, crop.height), interpolation=interpolation)
     whole = (share[crop.top : crop.top + height, crop.left : crop.left + width] > 0.999).astype(np.uint8)
@@ -171,7 +171,7 @@ def _fitted_depth(folder: Path, path: Path, camera: Camera, height: int, width: 
         raise InputError(f"{file}: depth of type {depth.dtype}, expected numbers")
     if depth.shape != shape:
         raise InputError(f"{file}: depth of shape {depth.shape}, expected {shape}, the size of {path.name}")
-    crop = cover(shape[1], shape[0], width, height)
+    crop = cover_crop(shape[1], shape[0], width, height)
     rows = np.floor((np.arange(height) + 0.5 + crop.top) / crop.scale_y).astype(int)
     columns = np.floor((np.arange(width) + 0.5 + crop.left) / crop.scale_x).astype(int)
     return depth[rows][:, columns]

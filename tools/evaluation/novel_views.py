@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from ...runtime.geometry.rigid import invert_rigid
-from ...runtime.images.writing import depth_colours
+from ...runtime.images.colormaps import colormap_depth
 from ...runtime.inference.predictor import Predictor
 from ...runtime.rendering.rasterizer import rasterize
 from ...runtime.rendering.types import Rendering
@@ -165,7 +165,7 @@ def comparison_strip(
     error = np.abs(rendering.rgb.clip(0, 1) - truth).mean(axis=2) * valid / WORST_ERROR
     hot = cv2.applyColorMap(np.rint(255 * error.clip(0, 1)).astype(np.uint8), cv2.COLORMAP_INFERNO)
     depth = np.where(rendering.alpha > LEAST_ALPHA, rendering.depth / np.maximum(rendering.alpha, LEAST_ALPHA), 0)
-    images = [truth, rendering.rgb, hot[..., ::-1].astype(np.float32) / 255, depth_colours(depth)]
+    images = [truth, rendering.rgb, hot[..., ::-1].astype(np.float32) / 255, colormap_depth(depth)]
     if plane is not None:
         images.append(plane)
     white = np.ones((len(truth), GAP, 3), np.float32)

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ...runtime.cli.terminal import literal, say
-from ...runtime.system.files import replacing
+from ...runtime.system.files import atomic_write
 from .novel_views import MODEL, NEAREST, ORACLE_DEPTH, ORACLE_PLANE, Result, Scores
 
 RESULTS = "results.json"
@@ -68,7 +68,7 @@ def write_results(folder: Path, about: dict[str, Any], means: Scores, results: S
     """Write `results.json`: what was evaluated, the means, every scene and every target; returns its path."""
     content = {**about, "mean": means, "scenes": [asdict(result) for result in results]}
     path = folder / RESULTS
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(content, indent=1) + "\n")
     return path
 

@@ -12,11 +12,12 @@ import typer
 from ...runtime.cameras.io import read_cameras
 from ...runtime.cli.terminal import run, say
 from ...runtime.errors import exit_on_input_error
-from ...runtime.images.writing import depth_colours, save_png
+from ...runtime.images.colormaps import colormap_depth
+from ...runtime.images.png import save_png
 from ...runtime.inference.bundled_model import bundled_model
 from ...runtime.inference.predictor import Predictor
 from ...runtime.rendering.render import render_view
-from ...runtime.views.batch import prepare
+from ...runtime.views.batch import build_view_batch
 
 # Two images, and one between them that the model is not given.
 CONTEXT, BETWEEN = (1, 3), 2
@@ -32,13 +33,13 @@ def image(
     predictor = Predictor(bundled_model())
     height, width = predictor.size_for(cameras)
     pairs = [(scene / cameras[view].name, cameras[view]) for view in (*CONTEXT, BETWEEN)]
-    given = prepare(pairs[: len(CONTEXT)], None, height, width)
+    given = build_view_batch(pairs[: len(CONTEXT)], None, height, width)
     found = predictor.predict_views(given)
-    views = prepare(pairs, None, height, width)
+    views = build_view_batch(pairs, None, height, width)
     pixels = views.intrinsics[-1].astype(np.float64) * np.array([width, height, 1.0])[:, None]
     between = render_view(found.need_gaussians(), views.extrinsics[-1], pixels, width, height).rgb
     first, second, truth = views.images.transpose(0, 2, 3, 1)
-    save_png(out, np.hstack([first, depth_colours(found.depth[0]), between, truth, second]).astype(np.float32))
+    save_png(out, np.hstack([first, colormap_depth(found.depth[0]), between, truth, second]).astype(np.float32))
     say(f"wrote {out}")
 
 

@@ -19,7 +19,7 @@ import typer
 from ...runtime.cli.outputs import Overwrite, guards_outputs, outputs
 from ...runtime.cli.terminal import run, say
 from ...runtime.errors import exit_on_input_error
-from ...runtime.system.files import replacing
+from ...runtime.system.files import atomic_write
 
 if TYPE_CHECKING:  # compiled code is loaded only once there is something to draw
     from .layout import Layout
@@ -46,7 +46,7 @@ def make_scene(
     overwrite: Overwrite = False,
 ) -> None:
     """Draw photographs of a furnished room that exists only in numbers, with its cameras and exact depth."""
-    from ...runtime.images.writing import save_png
+    from ...runtime.images.png import save_png
     from .layout import furnished_room
     from .sampler import render, scene_textures
 
@@ -67,9 +67,9 @@ def make_scene(
         if index == 0:
             exposure = BRIGHTNESS / max(float(image.mean()), 1e-3)
         save_png(images / f"{index:03}.png", exposure * image)
-        with replacing(depths / f"{index:03}.npz") as temporary:
+        with atomic_write(depths / f"{index:03}.npz") as temporary:
             np.savez_compressed(temporary, depth=depth)
-    with replacing(cameras) as temporary:
+    with atomic_write(cameras) as temporary:
         temporary.write_text(json.dumps(_transforms(poses, intrinsics, width, height), indent=1) + "\n")
     say(f"{views} photographs in {images}, their cameras in {cameras}, true depth in {depths}")
 

@@ -16,9 +16,9 @@ from ...runtime.cameras.camera import Camera
 from ...runtime.cameras.io import read_cameras
 from ...runtime.errors import InputError
 from ...runtime.inference.normalization import SceneNormalization
-from ...runtime.views.batch import Views as Photographs
-from ...runtime.views.batch import prepare, take
-from ...runtime.views.depth_range import find_depth_range
+from ...runtime.views.batch import ViewBatch, build_view_batch
+from ...runtime.views.depth_range import estimate_depth_range
+from ...runtime.views.loader import load_view
 from ..synthetic.sampler import crop_intrinsics
 from .scenes import SampleSpec, Views
 
@@ -78,13 +78,13 @@ class FolderScenes:
         return self._views(rng, context, targets[: len(target_zooms)], replace(spec, target_zooms=target_zooms))
 
     def _views(self, rng: np.random.Generator, context: Pairs, targets: Pairs, spec: SampleSpec) -> Views:
-        photographs = prepare([*context, *targets], None, spec.height, spec.width)
+        photographs = build_view_batch([*context, *targets], None, spec.height, spec.width)
         windows = [_target(rng, pair, zoom, spec) for pair, zoom in zip(targets, spec.target_zooms, strict=True)]
         return self._to_views(photographs, len(context), windows)
 
-    def _to_views(self, photographs: Photographs, context: int, targets: Sequence[tuple[Tensor, Tensor]]) -> Views:
+    def _to_views(self, photographs: ViewBatch, context: int, targets: Sequence[tuple[Tensor, Tensor]]) -> Views:
         given = photographs.images, photographs.extrinsics, photographs.intrinsics
-        found = find_depth_range(*given, photographs.cameras, self.trained)
+        found = estimate_depth_range(*given, photographs.cameras, self.trained)
         frame = SceneNormalization.of(photographs.extrinsics[:context], np.array([found.near]), self.trained[0])
         near, far = (torch.full((context,), depth * frame.scale) for depth in (found.near, found.far))
         poses = torch.from_numpy(frame.apply(photographs.extrinsics))
@@ -103,11 +103,11 @@ class FolderScenes:
 
 def _target(rng: np.random.Generator, pair: tuple[Path, Camera], zoom: int, spec: SampleSpec) -> tuple[Tensor, Tensor]:
     """A crop [3, height, width] of an image `zoom` times as large as the context images, and its intrinsics [3, 3]."""
-    large, intrinsics, _ = take(pair, zoom * spec.height, zoom * spec.width)
+    view = load_view(pair, zoom * spec.height, zoom * spec.width)
     top, left = (int(rng.integers((zoom - 1) * side + 1)) for side in (spec.height, spec.width))
-    image = large[:, top : top + spec.height, left : left + spec.width].copy()
+    image = view.image[:, top : top + spec.height, left : left + spec.width].copy()
     corner = np.array([left / spec.width, top / spec.height])
-    return torch.from_numpy(image), torch.from_numpy(crop_intrinsics(intrinsics, zoom, corner).astype(np.float32))
+    return torch.from_numpy(image), torch.from_numpy(crop_intrinsics(view.intrinsics, zoom, corner).astype(np.float32))
 
 
 def _pairs(folder: Path) -> Pairs:

@@ -15,7 +15,7 @@ from ...model.common.gaussian_adapter import SCALE_SHIFT
 from ...model.common.geometry import Cameras
 from ...model.idesplat.gaussian_head import HeadInputs
 from ...model.idesplat.network import IDESplat
-from ...runtime.system.files import make_folder, replacing
+from ...runtime.system.files import atomic_write, make_folder
 from ..synthetic.sampler import TRAINING_SEEDS
 from .losses import Perceptual, offset_loss, render_loss
 from .scenes import MAX_TARGET_ZOOM, SampleSpec, Views
@@ -61,7 +61,7 @@ class FeatureCache:
         torch.set_flush_denormal(True)  # a setting of each thread
         path = self.folder / f"{spec.seed}-{spec.context}-{'real' if spec.real else 'synthetic'}.pt"
         if not path.exists():
-            with replacing(path) as temporary:
+            with atomic_write(path) as temporary:
                 torch.save(_packed(self._compute(spec)), temporary)
         return _unpacked(torch.load(path, weights_only=True))
 

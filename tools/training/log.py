@@ -9,8 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ...runtime.errors import refuse
-from ...runtime.system.files import read_bytes, replacing
+from ...runtime.errors import raise_input_error
+from ...runtime.system.files import atomic_write, read_bytes
 
 CURVES_SIZE = (360, 900)  # pixels, of one curve
 MARGIN = 60
@@ -27,7 +27,7 @@ class TrainingLog:
         """`path`: the file. `step`: the number of steps done; lines of later ones are of a past that is repeated."""
         self.path = path
         self.entries = [entry for entry in _read(path) if entry["step"] <= step]
-        with replacing(path) as temporary:
+        with atomic_write(path) as temporary:
             temporary.write_text("".join(json.dumps(entry) + "\n" for entry in self.entries))
 
     def add(self, entry: dict[str, Any]) -> None:
@@ -58,7 +58,9 @@ def _read(path: Path) -> list[dict[str, Any]]:
         if entry is not None:
             entries.append(entry)
         elif number < len(lines):  # every line that was written whole has an end, and something behind it
-            refuse(path, f"line {number} is none of a training log", "move the file away, or choose another --out")
+            raise_input_error(
+                path, f"line {number} is none of a training log", "move the file away, or choose another --out"
+            )
     return entries
 
 
@@ -131,7 +133,7 @@ def write_rows(path: Path, rows: list[np.ndarray]) -> None:
 
 
 def _write(path: Path, bgr: np.ndarray) -> None:
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         cv2.imwrite(str(temporary), bgr)
 
 

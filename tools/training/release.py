@@ -15,7 +15,7 @@ from ...export.cli import export
 from ...runtime.cli.terminal import run
 from ...runtime.errors import exit_on_input_error
 from ...runtime.inference.bundled_model import CHECKSUM_SUFFIX, FOLDER, NAME
-from ...runtime.system.files import make_folder, replacing
+from ...runtime.system.files import atomic_write, make_folder
 
 PRESET = "idesplat-tiny"
 
@@ -29,7 +29,7 @@ def release_bundled_model(
     path = make_folder(FOLDER) / NAME
     export(checkpoint, path, preset=preset)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    with replacing(path.with_name(NAME + CHECKSUM_SUFFIX)) as temporary:
+    with atomic_write(path.with_name(NAME + CHECKSUM_SUFFIX)) as temporary:
         temporary.write_text(f"{digest}  {NAME}\n")
 
 

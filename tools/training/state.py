@@ -12,7 +12,7 @@ from ...model.checkpoint import CheckpointError, fill, read_state_dict
 from ...model.config import IDESplatConfig
 from ...model.idesplat.network import IDESplat
 from ...runtime.errors import InputError
-from ...runtime.system.files import check_regular, replacing
+from ...runtime.system.files import atomic_write, check_regular
 from .gather_attention import with_compiled_products
 from .initialization import new_model
 
@@ -102,7 +102,7 @@ class TrainingState:
                 "settings": settings,
             },
         }
-        with replacing(path) as temporary:
+        with atomic_write(path) as temporary:
             torch.save(content, temporary)
 
     def resume(self, path: Path, settings: dict[str, Any]) -> None:

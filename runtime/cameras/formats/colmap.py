@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...errors import InputError, located
-from ...geometry.depth_bounds import range_of_depths
-from ...geometry.intrinsics import calibration
+from ...errors import InputError, error_context
+from ...geometry.depth_bounds import depth_bounds
+from ...geometry.intrinsics import intrinsic_matrix
 from ...geometry.rigid import invert_rigid
 from ...system.files import check_regular, open_regular
 from ..camera import Camera
@@ -62,8 +62,8 @@ UNFINISHED = "COLMAP's library did not finish reading this model; is it damaged?
 INSTALL = 'pip install "idesplat[colmap]"'
 
 
-def read(path: Path, pictures: Sequence[Path] = ()) -> list[Camera]:
-    """Read the model in a folder, in its usual place below, or beside one of its files; `pictures` are not needed.
+def read(path: Path, images: Sequence[Path] = ()) -> list[Camera]:
+    """Read the model in a folder, in its usual place below, or beside one of its files; `images` are not needed.
 
     Raises InputError, also where pycolmap is not installed.
     """
@@ -74,7 +74,7 @@ def read(path: Path, pictures: Sequence[Path] = ()) -> list[Camera]:
         raise InputError(f"holds {len(models)} COLMAP models; give one of them, such as {models[0]}")
     cameras = []
     for image in _read_apart(models[0]):
-        with located(image["name"]):
+        with error_context(image["name"]):
             cameras.append(to_camera(image))
     return cameras
 
@@ -143,7 +143,7 @@ def to_camera(image: dict[str, Any]) -> Camera:
         raise InputError(f"camera model {model}, expected one of {known}; run COLMAP's image_undistorter first")
     values = dict(zip(fields, image["parameters"], strict=True))
     focal = values.get("f", 0.0)
-    K = calibration(values.get("fx", focal), values.get("fy", focal), values["cx"], values["cy"])
+    K = intrinsic_matrix(values.get("fx", focal), values.get("fy", focal), values["cx"], values["cy"])
     extrinsics = invert_rigid(np.array([*image["cam_from_world"], [0, 0, 0, 1]]))
     fisheye = model in FISHEYE
     order = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -178,7 +178,7 @@ def describe(reconstruction: "pycolmap.Reconstruction") -> list[dict[str, Any]]:
                 "height": camera.height,
                 "parameters": camera.params.tolist(),
                 "cam_from_world": image.cam_from_world().matrix().tolist(),  # [3, 4]
-                "depth_range": range_of_depths(observed_depths(reconstruction, image)),
+                "depth_range": depth_bounds(observed_depths(reconstruction, image)),
             }
         )
     return found

@@ -1,12 +1,12 @@
-"""Camera files of MVSNet and its kin (DTU, BlendedMVS, Tanks and Temples): one `<name>_cam.txt` for each picture.
+"""Camera files of MVSNet and its kin (DTU, BlendedMVS, Tanks and Temples): one `<name>_cam.txt` for each image.
 
     extrinsic              then 4 rows of a world-to-camera pose, OpenCV axes
     intrinsic              then 3 rows of K in pixels
     425.0 2.5              the least depth, the interval between planes; often their number and the largest depth
 
-A file `00000003_cam.txt` belongs to the picture `00000003.jpg`, or in DTU to `rect_004_....png`. The size of the
-picture is not in the file, so it must be given or stand beside. Where the principal point shows that K is meant for a
-quarter of the picture's size, as in MVSNet's training set, K is multiplied by four. The principal point is taken as
+A file `00000003_cam.txt` belongs to the image `00000003.jpg`, or in DTU to `rect_004_....png`. The size of the
+image is not in the file, so it must be given or stand beside. Where the principal point shows that K is meant for a
+quarter of the image's size, as in MVSNet's training set, K is multiplied by four. The principal point is taken as
 COLMAP's, with the centre of the first pixel at (.5, .5), since most of these files are made from COLMAP's.
 """
 
@@ -16,28 +16,28 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import InputError, located
+from ...errors import InputError, error_context
 from ...geometry.rigid import invert_rigid
 from ..camera import Camera
 from ..parsing import numbers, read_text
 
 ENDINGS = ("_cam.txt", "cam.txt")
-PICTURE_FOLDERS = (".", "..", "../images", "../blended_images", "../image")
+IMAGE_FOLDERS = (".", "..", "../images", "../blended_images", "../image")
 DTU_PICTURE = re.compile(r"rect_(\d+)_")  # counted from 1, while the camera files are from 0
-QUARTER = 4  # size of the picture over that which MVSNet's training K is meant for
+QUARTER = 4  # size of the image over that which MVSNet's training K is meant for
 USUAL_PLANES = 192  # where a file does not say how many there are
 MIDDLE = (0.4, 0.6)  # where principal points are, in widths and heights
 
 
-def read(path: Path, pictures: Sequence[Path] = ()) -> list[Camera]:
-    """Read one file, or all `*_cam.txt` of a folder; `pictures` give the size. Raises InputError."""
+def read(path: Path, images: Sequence[Path] = ()) -> list[Camera]:
+    """Read one file, or all `*_cam.txt` of a folder; `images` give the size. Raises InputError."""
     files = files_in(path) if path.is_dir() else [path]
     if not files:
-        raise InputError("holds no *_cam.txt, expected one for each picture")
-    candidates = [*pictures, *_pictures_near(files[0].parent)]
+        raise InputError("holds no *_cam.txt, expected one for each image")
+    candidates = [*images, *_images_near(files[0].parent)]
     cameras = []
     for file in files:
-        with located(file.name):
+        with error_context(file.name):
             cameras.append(_camera(file, candidates))
     return cameras
 
@@ -48,19 +48,20 @@ def files_in(folder: Path) -> list[Path]:
 
 
 def _camera(file: Path, candidates: Sequence[Path]) -> Camera:
-    from ..image_files import GIVE_PICTURES, size_of
+    from ...images.header import image_size
+    from ..image_files import GIVE_IMAGES
 
     pose, K, depth_range = _parse(read_text(file))
     name = file.name
     for ending in ENDINGS:
         name = name.removesuffix(ending)
-    picture = _picture(name, candidates)
-    if picture is None:
-        raise InputError(f"gives no size in pixels, and there is no picture {name}.*; {GIVE_PICTURES}")
-    width, height = size_of(picture)
+    image = _image(name, candidates)
+    if image is None:
+        raise InputError(f"gives no size in pixels, and there is no image {name}.*; {GIVE_IMAGES}")
+    width, height = image_size(image)
     if _is_quarter(K, width, height):
         K = np.diag([QUARTER, QUARTER, 1]) @ K
-    return Camera(picture.name, width, height, K, invert_rigid(pose), depth_range=depth_range)
+    return Camera(image.name, width, height, K, invert_rigid(pose), depth_range=depth_range)
 
 
 def _parse(text: str) -> tuple[np.ndarray, np.ndarray, tuple[float, float] | None]:
@@ -68,14 +69,14 @@ def _parse(text: str) -> tuple[np.ndarray, np.ndarray, tuple[float, float] | Non
     words = text.split()
     if words[:1] != ["extrinsic"] or words[17:18] != ["intrinsic"]:
         raise InputError("expected 'extrinsic' and 16 numbers, then 'intrinsic' and 9 numbers")
-    with located("extrinsic"):
+    with error_context("extrinsic"):
         pose = np.array(numbers(words[1:17])).reshape(4, 4)
-    with located("intrinsic"):
+    with error_context("intrinsic"):
         values = numbers(words[18:27])
         if len(values) != 9:
             raise InputError(f"has {len(values)} numbers, expected 9: is the file cut off?")
         K = np.array(values).reshape(3, 3)
-    with located("depth"):
+    with error_context("depth"):
         return pose, K, _depth_range(numbers(words[27:31]))
 
 
@@ -90,11 +91,11 @@ def _depth_range(values: Sequence[float]) -> tuple[float, float] | None:
     return least, values[3] if len(values) > 3 else least + interval * (planes - 1)
 
 
-def _picture(name: str, candidates: Sequence[Path]) -> Path | None:
-    from ...images.io import stem
+def _image(name: str, candidates: Sequence[Path]) -> Path | None:
+    from ...images.io import image_stem
 
     for candidate in candidates:
-        if stem(candidate) == name:
+        if image_stem(candidate) == name:
             return candidate
     if name.isdecimal():
         for candidate in candidates:
@@ -104,10 +105,10 @@ def _picture(name: str, candidates: Sequence[Path]) -> Path | None:
     return None
 
 
-def _pictures_near(folder: Path) -> list[Path]:
-    from ..image_files import pictures_in
+def _images_near(folder: Path) -> list[Path]:
+    from ..image_files import images_in_folder
 
-    return [picture for place in PICTURE_FOLDERS for picture in pictures_in(folder / place)]
+    return [image for place in IMAGE_FOLDERS for image in images_in_folder(folder / place)]
 
 
 def _is_quarter(K: np.ndarray, width: int, height: int) -> bool:

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import InputError, located
-from ...geometry.intrinsics import calibration
+from ...errors import InputError, error_context
+from ...geometry.intrinsics import intrinsic_matrix
 from ...system.files import check_regular
 from ..camera import Camera
 
@@ -21,13 +21,13 @@ NEAR_ROOM, FAR_ROOM = 0.75, 1.5
 IMAGE_FOLDERS = ("images", "images_4", "images_8")
 
 
-def read(path: Path, pictures: Sequence[Path] = ()) -> list[Camera]:
-    """Read the file; `pictures`, or those in `images` beside the file, give the names. Raises InputError."""
+def read(path: Path, images: Sequence[Path] = ()) -> list[Camera]:
+    """Read the file; `images`, or those in `images` beside the file, give the names. Raises InputError."""
     path = path / FILE_NAME if path.is_dir() else path
     rows = _rows(path)
     cameras = []
-    for index, (name, row) in enumerate(zip(_names(len(rows), path.parent, pictures), rows, strict=True)):
-        with located(f"row {index} ({name})"):
+    for index, (name, row) in enumerate(zip(_names(len(rows), path.parent, images), rows, strict=True)):
+        with error_context(f"row {index} ({name})"):
             cameras.append(_camera(name, row))
     return cameras
 
@@ -40,7 +40,7 @@ def _camera(name: str, row: np.ndarray) -> Camera:
         raise InputError(f"the image's size is {width:g} x {height:g}, expected whole pixels")
     pose = np.eye(4)
     pose[:3] = np.stack([right, down, -backwards, position], axis=1)
-    K = calibration(focal, focal, width / 2, height / 2)
+    K = intrinsic_matrix(focal, focal, width / 2, height / 2)
     near, far = float(row[15]), float(row[16])
     return Camera(name, int(width), int(height), K, pose, depth_range=(NEAR_ROOM * near, FAR_ROOM * far))
 
@@ -65,23 +65,23 @@ def _rows(path: Path) -> np.ndarray:
     return np.array(rows, np.float64)
 
 
-def _names(count: int, folder: Path, pictures: Sequence[Path]) -> list[str]:
+def _names(count: int, folder: Path, images: Sequence[Path]) -> list[str]:
     """The photographs that the rows belong to: all that were given, or those beside the file, if the number is right.
 
     Without any, the rows are numbered.
     """
-    from ..image_files import pictures_in
+    from ..image_files import images_in_folder
 
     found = [
-        sorted(pictures, key=lambda picture: picture.name),
-        *(pictures_in(folder / name) for name in IMAGE_FOLDERS),
+        sorted(images, key=lambda image: image.name),
+        *(images_in_folder(folder / name) for name in IMAGE_FOLDERS),
     ]
     for candidates in found:
         if len(candidates) == count:
             return [candidate.name for candidate in candidates]
-    if pictures:
+    if images:
         raise InputError(
-            f"holds {count} cameras without names, and {len(pictures)} images were given; give all {count}, "
+            f"holds {count} cameras without names, and {len(images)} images were given; give all {count}, "
             f"or keep them in {IMAGE_FOLDERS[0]} beside the file"
         )
     return [f"{index:03}" for index in range(count)]

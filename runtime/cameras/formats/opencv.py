@@ -2,7 +2,7 @@
 
 A point x of the first camera is R x + T in the second; the first camera is the world. OpenCV's pixel centres are whole
 numbers, so half a pixel is added to its principal points. Where a calibration is in two files, intrinsics.yml and
-extrinsics.yml, as OpenCV's sample writes it, either leads to the other. The file names no pictures: it takes two, the
+extrinsics.yml, as OpenCV's sample writes it, either leads to the other. The file names no images: it takes two, the
 left (first) one before the right one, and their size where the file lacks it.
 """
 
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import InputError, located
+from ...errors import InputError, error_context
 from ...geometry.rigid import invert_rigid
 from ...system.files import read_bytes
 from ..camera import Camera
@@ -30,25 +30,25 @@ NAMES = ("left", "right")
 HALF_PIXEL = 0.5
 
 
-def read(path: Path, pictures: Sequence[Path] = ()) -> list[Camera]:
-    """Read the file; `pictures` are the left and the right one, in this order. Raises InputError."""
-    if pictures and len(pictures) != len(NAMES):
+def read(path: Path, images: Sequence[Path] = ()) -> list[Camera]:
+    """Read the file; `images` are the left and the right one, in this order. Raises InputError."""
+    if images and len(images) != len(NAMES):
         raise InputError(
-            f"calibrates two cameras, and {len(pictures)} images were given; give the left and the right one"
+            f"calibrates two cameras, and {len(images)} images were given; give the left and the right one"
         )
     fields = _fields(path)
     other = path.with_stem(OTHER_HALF.get(path.stem, path.stem))
     if other != path and other.is_file():
-        with located(other.name):
+        with error_context(other.name):
             fields = {**_fields(other), **fields}
     pose = np.eye(4)
     pose[:3, :3] = _rotation(_matrix(fields, ROTATION))
     pose[:3, 3] = _matrix(fields, TRANSLATION, (3,))
     cameras = []
     for index, extrinsics in enumerate((np.eye(4), invert_rigid(pose))):
-        name = pictures[index].name if pictures else NAMES[index]
-        with located(f"camera {index + 1}"):
-            size = _size(fields, pictures[index : index + 1])
+        name = images[index].name if images else NAMES[index]
+        with error_context(f"camera {index + 1}"):
+            size = _size(fields, images[index : index + 1])
             cameras.append(_camera(fields, index + 1, name, size, extrinsics))
     return cameras
 
@@ -120,8 +120,8 @@ def _rotation(value: np.ndarray) -> np.ndarray:
     return value
 
 
-def _size(fields: dict[str, Any], pictures: Sequence[Path]) -> tuple[int, int]:
-    """Width and height, from the file or else from the picture."""
+def _size(fields: dict[str, Any], images: Sequence[Path]) -> tuple[int, int]:
+    """Width and height, from the file or else from the image."""
     size = next((fields[name] for name in SIZE if name in fields), None)
     if isinstance(size, np.ndarray) and size.size == 2:
         width, height = size.ravel().tolist()
@@ -131,8 +131,9 @@ def _size(fields: dict[str, Any], pictures: Sequence[Path]) -> tuple[int, int]:
         if not (width.is_integer() and height.is_integer()):
             raise InputError(f"the image's size is {width:g} x {height:g}, expected whole pixels")
         return int(width), int(height)
-    from ..image_files import GIVE_PICTURES, size_of
+    from ...images.header import image_size
+    from ..image_files import GIVE_IMAGES
 
-    if not pictures:
-        raise InputError(f"gives no {SIZE[0]}, and there is no picture to take it from; {GIVE_PICTURES}")
-    return size_of(pictures[0])
+    if not images:
+        raise InputError(f"gives no {SIZE[0]}, and there is no image to take it from; {GIVE_IMAGES}")
+    return image_size(images[0])

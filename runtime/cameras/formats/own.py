@@ -14,9 +14,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ...errors import InputError, located
-from ...geometry.intrinsics import calibration
-from ...system.files import replacing
+from ...errors import InputError, error_context
+from ...geometry.intrinsics import intrinsic_matrix
+from ...system.files import atomic_write
 from ..camera import Camera
 from ..parsing import entries, finite, image_name, number, pixels, pose, read_json, shown
 
@@ -24,8 +24,8 @@ FORMAT = "idesplat-cameras"
 VERSION = 1
 
 
-def read(path: Path, pictures: Sequence[Path] = ()) -> list[Camera]:
-    """Read the file; `pictures` are not needed. Raises InputError."""
+def read(path: Path, images: Sequence[Path] = ()) -> list[Camera]:
+    """Read the file; `images` are not needed. Raises InputError."""
     document = read_json(path)
     if document.get("format") != FORMAT:
         raise InputError(f'format is {shown(document.get("format"))}, expected "{FORMAT}"')
@@ -33,9 +33,9 @@ def read(path: Path, pictures: Sequence[Path] = ()) -> list[Camera]:
         raise InputError(f"version is {shown(document.get('version'))}, expected {VERSION}; update idesplat")
     cameras = []
     for index, entry in enumerate(entries(document, "cameras")):
-        with located(f"cameras[{index}]"):
+        with error_context(f"cameras[{index}]"):
             name = image_name(entry, "image")
-        with located(f"cameras[{index}] ({name})"):
+        with error_context(f"cameras[{index}] ({name})"):
             cameras.append(_camera(entry, name))
     return cameras
 
@@ -43,7 +43,7 @@ def read(path: Path, pictures: Sequence[Path] = ()) -> list[Camera]:
 def write(path: Path, cameras: Sequence[Camera]) -> None:
     """Write the file; `read` gives exactly the same numbers back. Raises InputError if the folder cannot be written."""
     lines = ",\n".join(json.dumps(_entry(camera)) for camera in cameras)
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(f'{{"format": "{FORMAT}", "version": {VERSION}, "cameras": [\n{lines}\n]}}\n')
 
 
@@ -55,7 +55,7 @@ def _camera(entry: dict[str, Any], name: str) -> Camera:
         name,
         pixels(entry, "width"),
         pixels(entry, "height"),
-        calibration(*(number(entry, field) for field in ("fx", "fy", "cx", "cy"))),
+        intrinsic_matrix(*(number(entry, field) for field in ("fx", "fy", "cx", "cy"))),
         pose(entry, "extrinsics"),
         _numbers(entry, "distortion"),
         fisheye,

@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...errors import InputError, located
-from ...geometry.intrinsics import calibration
-from ...system.files import replacing
+from ...errors import InputError, error_context
+from ...geometry.intrinsics import intrinsic_matrix
+from ...system.files import atomic_write
 from ..camera import Camera
 from ..parsing import entries, image_name, number, pixels, pose, read_json, shown
 
 if TYPE_CHECKING:
-    from ..image_files import PictureSizes
+    from ..image_files import ImageSizes
 
 FILE_NAME = "transforms.json"
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -35,17 +35,17 @@ INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y")
 NARROWEST_VIEW = 0.001  # radians
 
 
-def read(path: Path, pictures: Sequence[Path] = ()) -> list[Camera]:
-    """Read the file; `pictures` give the sizes that it lacks. Raises InputError."""
+def read(path: Path, images: Sequence[Path] = ()) -> list[Camera]:
+    """Read the file; `images` give the sizes that it lacks. Raises InputError."""
     path = path / FILE_NAME if path.is_dir() else path
     document = read_json(path)
-    sizes = _Sizes(path.parent, pictures)
+    sizes = _Sizes(path.parent, images)
     cameras: list[Camera] = []
     shared_size: tuple[int, int] | None = None
     for index, frame in enumerate(entries(document, "frames")):
-        with located(f"frames[{index}]"):
+        with error_context(f"frames[{index}]"):
             name = image_name(frame, "file_path")
-        with located(f"frames[{index}] ({name})"):
+        with error_context(f"frames[{index}] ({name})"):
             settings = ChainMap(frame, document)  # a frame's own values go before those of all
             if "w" in settings or "h" in settings:
                 size = pixels(settings, "w"), pixels(settings, "h")
@@ -67,7 +67,7 @@ def write(path: Path, cameras: Sequence[Camera]) -> None:
     written.
     """
     frames = [_frame(camera) for camera in cameras]
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(json.dumps({"frames": frames}, indent=1) + "\n")
 
 
@@ -116,7 +116,7 @@ def _calibration(settings: Mapping[str, Any], width: int, height: int) -> np.nda
         fy = fx
     cx = number(settings, "cx") if "cx" in settings else width / 2
     cy = number(settings, "cy") if "cy" in settings else height / 2
-    return calibration(fx, fy, cx, cy)
+    return intrinsic_matrix(fx, fy, cx, cy)
 
 
 def _focal(settings: Mapping[str, Any], field: str, size: int) -> float:
@@ -130,14 +130,14 @@ def _focal(settings: Mapping[str, Any], field: str, size: int) -> float:
 class _Sizes:
     """Sizes of images that the file does not tell."""
 
-    def __init__(self, folder: Path, pictures: Sequence[Path]) -> None:
-        self.folder, self.pictures = folder, pictures
+    def __init__(self, folder: Path, images: Sequence[Path]) -> None:
+        self.folder, self.images = folder, images
 
     @cached_property
-    def _found(self) -> "PictureSizes":
-        from ..image_files import PictureSizes  # loads OpenCV, which few of these files need
+    def _found(self) -> "ImageSizes":
+        from ..image_files import ImageSizes  # loads OpenCV, which few of these files need
 
-        return PictureSizes(self.folder, self.pictures)
+        return ImageSizes(self.folder, self.images)
 
     def size(self, name: str) -> tuple[int, int]:
         size = self._found.size(name)

@@ -16,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import refuse
-from ...geometry.quaternions import from_smallest_three, smallest_three, unit_quaternions
+from ...errors import raise_input_error
+from ...geometry.quaternions import from_smallest_three, normalize_quaternions, smallest_three
 from ...geometry.sh import SH_0
-from ...system.files import read_bytes, replacing
+from ...system.files import atomic_write, read_bytes
 from ..gaussians import Gaussians, check_finite, check_ranges
 from .morton import morton_order
 from .ply_header import LIST, Element, offset_comment, read_header
@@ -61,7 +61,7 @@ def write_compressed_ply(path: Path, gaussians: Gaussians, offset: np.ndarray | 
     ]
     chunks = np.stack([mean_ranges, scale_ranges, colour_ranges], axis=1).astype("<f4")  # [chunks, 3, 2, 3]
     rest = gaussians.sh[order, 1:].transpose(0, 2, 1)  # [gaussians, 3, coefficients]
-    with replacing(path) as temporary, temporary.open("wb") as file:
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
         comment = "" if offset is None else offset_comment(offset)
         file.write(_header(len(chunks), len(gaussians), rest[0].size if len(rest) else 0, comment).encode("ascii"))
         file.write(chunks.tobytes())
@@ -143,7 +143,7 @@ def _unpack(packed: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
 
 def _pack_rotations(quats: np.ndarray) -> np.ndarray:
     """Which part of wxyz is the largest in the upper two bits, then the others, which lie within sqrt(1/2)."""
-    largest, others = smallest_three(unit_quaternions(quats))
+    largest, others = smallest_three(normalize_quaternions(quats))
     shares = np.clip(others * np.sqrt(0.5) + 0.5, 0, 1)
     return largest.astype(np.uint32) << sum(ROTATION_BITS) | _pack(shares, ROTATION_BITS)
 
@@ -176,12 +176,12 @@ def _read_tables(path: Path, content: bytes) -> dict[str, np.ndarray]:
     tables = {}
     for element in elements:
         if LIST in element.properties.values():
-            refuse(path, f"element {element.name} has a list property", REMEDY)
+            raise_input_error(path, f"element {element.name} has a list property", REMEDY)
         if not element.properties:
             continue
         row, end = element.row, offset + element.length * element.row.itemsize
         if len(content) < end:
-            refuse(
+            raise_input_error(
                 path,
                 f"cut short: {element.length} rows of {element.name} need {end} bytes, the file has {len(content)}",
                 "copy or download it again",
@@ -195,17 +195,21 @@ def _check_elements(path: Path, elements: dict[str, Element]) -> None:
     """Refuse elements with other properties than the layout's, or lengths that do not belong together."""
     for name in ("chunk", "vertex"):
         if name not in elements:
-            refuse(path, f"no element {name}", REMEDY)
+            raise_input_error(path, f"no element {name}", REMEDY)
     chunk, vertex = elements["chunk"], elements["vertex"]
     if chunk.properties not in [dict.fromkeys(names, "<f4") for names in (CHUNK_PROPERTIES, WITHOUT_COLOURS)]:
-        refuse(path, "element chunk has other properties than the format's", REMEDY)
+        raise_input_error(path, "element chunk has other properties than the format's", REMEDY)
     if vertex.properties != dict.fromkeys(VERTEX_PROPERTIES, "<u4"):
-        refuse(path, "element vertex has other properties than the format's", REMEDY)
+        raise_input_error(path, "element vertex has other properties than the format's", REMEDY)
     if chunk.length != ceil(vertex.length / CHUNK):
-        refuse(path, f"{chunk.length} chunks for {vertex.length} Gaussians", f"expected one for every {CHUNK}")
+        raise_input_error(
+            path, f"{chunk.length} chunks for {vertex.length} Gaussians", f"expected one for every {CHUNK}"
+        )
     if "sh" in elements:
         sh = elements["sh"]
         if len(sh.properties) not in (9, 24, 45) or sh.length != vertex.length:
-            refuse(path, f"{sh.length} rows of {len(sh.properties)} spherical harmonics", "expected 9, 24 or 45 each")
+            raise_input_error(
+                path, f"{sh.length} rows of {len(sh.properties)} spherical harmonics", "expected 9, 24 or 45 each"
+            )
         if sh.properties != {f"f_rest_{index}": "<u1" for index in range(len(sh.properties))}:
-            refuse(path, "element sh has other properties than the format's", REMEDY)
+            raise_input_error(path, "element sh has other properties than the format's", REMEDY)

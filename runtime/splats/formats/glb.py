@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import InputError, refuse
-from ...geometry.quaternions import unit_quaternions
-from ...images.writing import linear_colours, to_bytes
-from ...system.files import check_expansion, read_bytes, replacing
+from ...errors import InputError, raise_input_error
+from ...geometry.quaternions import normalize_quaternions
+from ...images.colormaps import srgb_to_linear, to_uint8
+from ...system.files import atomic_write, check_expansion, read_bytes
 from ..axes import GLTF, convert_axes
 from ..gaussians import Gaussians, bytes_in_memory, check_finite, check_ranges
 from .ply_header import OFFSET, checked_offset
@@ -58,8 +58,8 @@ def write_glb(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None
     turned = convert_axes(gaussians, GLTF)
     attributes = {
         "POSITION": turned.means,
-        "COLOR_0": to_bytes(np.column_stack([linear_colours(turned.colours), turned.opacities])),
-        PREFIX + "ROTATION": np.roll(unit_quaternions(turned.quats), -1, axis=1),
+        "COLOR_0": to_uint8(np.column_stack([srgb_to_linear(turned.colours), turned.opacities])),
+        PREFIX + "ROTATION": np.roll(normalize_quaternions(turned.quats), -1, axis=1),
         PREFIX + "SCALE": turned.scales,
         PREFIX + "OPACITY": turned.opacities,
     }
@@ -71,7 +71,7 @@ def write_glb(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None
     document = json.dumps(content, separators=(",", ":")).encode()
     document += b" " * (-len(document) % 4)
     size = sum(values.nbytes for values in attributes.values())
-    with replacing(path) as temporary, temporary.open("wb") as file:
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
         file.write(HEADER.pack(MAGIC, VERSION, HEADER.size + 2 * CHUNK.size + len(document) + size))
         file.write(CHUNK.pack(len(document), JSON) + document + CHUNK.pack(size, BINARY))
         for values in attributes.values():
@@ -87,10 +87,12 @@ def read_glb(path: Path) -> Gaussians:
     except InputError:
         raise
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        refuse(path, f"not glTF as it should be ({type(error).__name__}: {str(error)[:60]})", "write it again")
+        raise_input_error(
+            path, f"not glTF as it should be ({type(error).__name__}: {str(error)[:60]})", "write it again"
+        )
     check_finite(path, gaussians)
     if (gaussians.scales < 0).any() or ((gaussians.opacities < 0) | (gaussians.opacities > 1)).any():
-        refuse(path, "negative scales, or opacities outside 0 to 1", "write it again")
+        raise_input_error(path, "negative scales, or opacities outside 0 to 1", "write it again")
     return convert_axes(gaussians, GLTF)
 
 
@@ -115,7 +117,7 @@ def _read_gaussians(path: Path, document: dict[str, Any], binary: bytes) -> Gaus
     def read(name: str, kind: str) -> np.ndarray:
         values = _read_accessor(path, document, binary, attributes[name], kind)
         if len(values) != count:
-            refuse(path, f"{len(values)} values of {name} for {count} splats", "write it again")
+            raise_input_error(path, f"{len(values)} values of {name} for {count} splats", "write it again")
         return values
 
     means = read("POSITION", "VEC3")
@@ -170,9 +172,9 @@ def _document(attributes: dict[str, np.ndarray]) -> dict[str, Any]:
 def _chunks(path: Path, content: bytes) -> tuple[dict[str, Any], bytes]:
     """The JSON document and the binary chunk."""
     if not content.startswith(MAGIC):
-        refuse(path, "not a .glb file (it does not begin with 'glTF')", f"expected {EXPECTED}")
+        raise_input_error(path, "not a .glb file (it does not begin with 'glTF')", f"expected {EXPECTED}")
     if len(content) < HEADER.size + CHUNK.size or HEADER.unpack_from(content)[2] > len(content):
-        refuse(path, "cut short", "copy or download it again")
+        raise_input_error(path, "cut short", "copy or download it again")
     chunks: dict[bytes, bytes] = {}
     offset = HEADER.size
     while offset + CHUNK.size <= len(content):
@@ -183,9 +185,9 @@ def _chunks(path: Path, content: bytes) -> tuple[dict[str, Any], bytes]:
     try:
         document = json.loads(chunks.get(JSON, b""))
     except (ValueError, RecursionError):
-        refuse(path, "its JSON cannot be read", "copy or download it again")
+        raise_input_error(path, "its JSON cannot be read", "copy or download it again")
     if not isinstance(document, dict):
-        refuse(path, "its JSON is no glTF", "write it again")
+        raise_input_error(path, "its JSON is no glTF", "write it again")
     return document, chunks.get(BINARY, b"")
 
 
@@ -195,17 +197,17 @@ def _splat_attributes(path: Path, document: dict[str, Any]) -> dict[str, int]:
     splats = [part for part in primitives if EXTENSION in part.get("extensions", {})]
     if len(splats) != 1:
         what = f"{len(splats)} clouds of splats ({EXTENSION})"
-        refuse(path, what, "expected one; a mesh or point cloud holds no Gaussians")
+        raise_input_error(path, what, "expected one; a mesh or point cloud holds no Gaussians")
     if splats[0]["extensions"][EXTENSION].get("extensions"):
-        refuse(path, "the splats are compressed by a further extension", "write it without")
+        raise_input_error(path, "the splats are compressed by a further extension", "write it without")
     for node in document.get("nodes", []):
         if any(node.get(name, still) != still for name, still in STANDING_STILL.items()):
-            refuse(path, "a node moves or turns the splats", "write it with the transformation applied")
+            raise_input_error(path, "a node moves or turns the splats", "write it with the transformation applied")
     attributes = splats[0]["attributes"]
     needed = ["POSITION", PREFIX + "ROTATION", PREFIX + "SCALE", PREFIX + "OPACITY", *_coefficients(0)]
     missing = [name for name in needed if name not in attributes]
     if missing:
-        refuse(path, f"the splats have no {', '.join(missing)}", "write it again")
+        raise_input_error(path, f"the splats have no {', '.join(missing)}", "write it again")
     return attributes
 
 
@@ -213,16 +215,18 @@ def _read_accessor(path: Path, document: dict[str, Any], binary: bytes, index: i
     """One array of the document as float32 [count, parts]."""
     accessor = document["accessors"][index]
     if accessor["type"] != kind or "sparse" in accessor:
-        refuse(path, f"accessor {index} is {accessor['type']}", f"expected {kind} without sparse values")
+        raise_input_error(path, f"accessor {index} is {accessor['type']}", f"expected {kind} without sparse values")
     view = document["bufferViews"][accessor["bufferView"]]
     if view["buffer"] != 0 or "uri" in document["buffers"][0]:
-        refuse(path, f"accessor {index} lies outside the file", "write all in one .glb")
+        raise_input_error(path, f"accessor {index} lies outside the file", "write all in one .glb")
     name, highest = COMPONENTS[accessor["componentType"]]
     number, parts = np.dtype(name), WIDTHS[kind]
     stride = view.get("byteStride", number.itemsize * parts)
     start, count = view.get("byteOffset", 0) + accessor.get("byteOffset", 0), accessor["count"]
     end = start + (count - 1) * stride + number.itemsize * parts
     if min(start, count - 1, stride - number.itemsize * parts, len(binary) - end) < 0:
-        refuse(path, f"cut short: accessor {index} needs {end} bytes of {len(binary)}", "copy or download it again")
+        raise_input_error(
+            path, f"cut short: accessor {index} needs {end} bytes of {len(binary)}", "copy or download it again"
+        )
     values = np.ndarray((count, parts), number, binary, start, (stride, number.itemsize)).astype(np.float32)
     return np.maximum(values / highest, -1) if accessor.get("normalized") else values

@@ -13,8 +13,8 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
-from ...errors import InputError, refuse
-from ...system.files import open_regular, replacing
+from ...errors import InputError, raise_input_error
+from ...system.files import atomic_write, open_regular
 from ..gaussians import Gaussians, check_ranges
 from .ply_header import LIST, Element, offset_comment, read_header
 
@@ -37,7 +37,7 @@ def write_ply(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None
     comment = "" if offset is None else offset_comment(offset)
     element = f"element vertex {len(gaussians)}\n"
     header = f"ply\nformat binary_little_endian 1.0\n{comment}{element}{properties}end_header\n"
-    with replacing(path) as temporary, temporary.open("wb") as file:
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
         table = np.zeros((VERTICES_AT_ONCE, len(names)), "<f4")
         _reserve(file, len(header) + len(gaussians) * table.itemsize * len(names))
         file.write(header.encode("ascii"))
@@ -189,17 +189,19 @@ def _find_vertices(file: BinaryIO, path: Path) -> _Vertices:
         if element.name == "vertex":
             break
         if LIST in element.properties.values():
-            refuse(path, f"element {element.name} with lists stands before the vertices", "write the vertices first")
+            raise_input_error(
+                path, f"element {element.name} with lists stands before the vertices", "write the vertices first"
+            )
         offset += element.length * element.row.itemsize
     else:
-        refuse(path, "the header has no element vertex", "give a 3D Gaussian splatting .ply")
+        raise_input_error(path, "the header has no element vertex", "give a 3D Gaussian splatting .ply")
 
     sh_coefficients = _checked_properties(element, path)
     row = element.row
     offset += header_bytes
     expected, size = offset + element.length * row.itemsize, os.fstat(file.fileno()).st_size
     if size < expected:
-        refuse(
+        raise_input_error(
             path,
             f"cut short: {element.length} vertices need {expected} bytes, the file has {size}",
             "copy or download it again",
@@ -212,7 +214,7 @@ def _checked_properties(vertex: Element, path: Path) -> int:
     rest = sum(name.startswith("f_rest_") for name in vertex.properties)
     coefficients = 1 + rest // 3
     if rest not in (0, 9, 24, 45):
-        refuse(
+        raise_input_error(
             path,
             f"{rest} properties f_rest_*",
             "expected 0, 9, 24 or 45 (SH degree 0 to 3); write it with one of those",
@@ -221,14 +223,14 @@ def _checked_properties(vertex: Element, path: Path) -> int:
     needed = _columns(Gaussians(sample[:, 0], sample[:, 0], np.empty((0, 4)), np.empty(0), sample))
     missing = [name for name in needed if name not in vertex.properties]
     if missing:
-        refuse(
+        raise_input_error(
             path,
             f"element vertex has no property {', '.join(missing)}",
             "give a 3D Gaussian splatting .ply, not a mesh, plain points or a compressed splat",
         )
     for name in needed:
         if vertex.properties[name] not in ("<f4", "<f8"):
-            refuse(path, f"property {name} is not float or double", "write it as float")
+            raise_input_error(path, f"property {name} is not float or double", "write it as float")
     if LIST in vertex.properties.values():
-        refuse(path, "element vertex has a list property", "write the file without it")
+        raise_input_error(path, "element vertex has a list property", "write the file without it")
     return coefficients

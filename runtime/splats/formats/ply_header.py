@@ -5,7 +5,7 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
-from ...errors import InputError, refuse
+from ...errors import InputError, raise_input_error
 from ...system.files import open_regular
 
 MAX_HEADER_BYTES = 1 << 20
@@ -51,7 +51,9 @@ def read_header(file: BinaryIO, path: Path) -> tuple[list[Element], int]:
     Raises InputError, naming the path, if the file does not begin with such a header.
     """
     if file.readline(8).rstrip() != MAGIC:
-        refuse(path, "not a .ply file (it does not begin with the line 'ply')", "give a 3D Gaussian splatting .ply")
+        raise_input_error(
+            path, "not a .ply file (it does not begin with the line 'ply')", "give a 3D Gaussian splatting .ply"
+        )
     elements: list[Element] = []
     has_format = False
     while file.tell() < MAX_HEADER_BYTES:
@@ -62,7 +64,9 @@ def read_header(file: BinaryIO, path: Path) -> tuple[list[Element], int]:
             case ["format", "binary_little_endian", "1.0"]:
                 has_format = True
             case ["format", *form]:
-                refuse(path, f"format {' '.join(form)}", "expected binary_little_endian 1.0; convert the file to that")
+                raise_input_error(
+                    path, f"format {' '.join(form)}", "expected binary_little_endian 1.0; convert the file to that"
+                )
             case ["element", name, count] if count.isascii() and count.isdigit() and len(count) < 19:
                 elements.append(Element(name, int(count), {}))
             case ["property", kind, name] if elements and kind in NUMBER_TYPES:
@@ -74,13 +78,15 @@ def read_header(file: BinaryIO, path: Path) -> tuple[list[Element], int]:
             case ["comment" | "obj_info", *_] | []:
                 pass
             case words:
-                refuse(path, f"header line '{' '.join(words)[:60]}' means nothing here", "write the file again")
-    refuse(path, "the header has no end", "copy or download it again")
+                raise_input_error(
+                    path, f"header line '{' '.join(words)[:60]}' means nothing here", "write the file again"
+                )
+    raise_input_error(path, "the header has no end", "copy or download it again")
 
 
 def _add_property(element: Element, name: str, number_type: str, path: Path) -> None:
     if name in element.properties:
-        refuse(path, f"element {element.name} has property {name} twice", "write it once")
+        raise_input_error(path, f"element {element.name} has property {name} twice", "write it once")
     element.properties[name] = number_type
 
 
@@ -123,5 +129,7 @@ def checked_offset(path: Path, values: object) -> np.ndarray:
     except (TypeError, ValueError):
         offset = np.zeros(0)
     if offset.shape != (3,) or not np.isfinite(offset).all():
-        refuse(path, f"records the offset {str(values)[:60]}", "expected three finite numbers; write it again")
+        raise_input_error(
+            path, f"records the offset {str(values)[:60]}", "expected three finite numbers; write it again"
+        )
     return offset

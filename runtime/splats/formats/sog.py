@@ -21,9 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import InputError, refuse
-from ...geometry.quaternions import from_smallest_three, smallest_three, unit_quaternions
-from ...system.files import check_expansion, read_bytes, replacing
+from ...errors import InputError, raise_input_error
+from ...geometry.quaternions import from_smallest_three, normalize_quaternions, smallest_three
+from ...system.files import atomic_write, check_expansion, read_bytes
 from ..gaussians import Gaussians, bytes_in_memory, check_finite, check_ranges
 from .codebooks import ENTRIES, build_codebook, cluster_vectors, quantize
 from .morton import morton_order
@@ -72,7 +72,7 @@ def write_sog(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None
 
     log_scales = np.log(np.maximum(gaussians.scales, MIN_SCALE))
     files["scales.webp"], meta["scales"] = _coded(log_scales, "scales.webp")
-    largest, others = smallest_three(unit_quaternions(gaussians.quats))
+    largest, others = smallest_three(normalize_quaternions(gaussians.quats))
     files["quats.webp"] = _picture(
         np.column_stack([round_to_uint8(others * QUAT_STEPS + 127.5), LARGEST_PART + largest])
     )
@@ -83,7 +83,7 @@ def write_sog(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None
         pictures, meta["shN"] = _harmonics(gaussians.sh[:, 1:], gaussians.sh_degree)
         files |= pictures
 
-    with replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+    with atomic_write(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         for name, content in {**files, META: json.dumps(meta).encode()}.items():
             archive.writestr(
                 zipfile.ZipInfo(name), content
@@ -120,9 +120,11 @@ def _opened(path: Path) -> Iterator["_Reader"]:
     except InputError:
         raise
     except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, struct.error):
-        refuse(path, "not a zip archive, or damaged", f"expected {EXPECTED}")
+        raise_input_error(path, "not a zip archive, or damaged", f"expected {EXPECTED}")
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        refuse(path, f"not a .sog as it should be ({type(error).__name__}: {str(error)[:60]})", "write it again")
+        raise_input_error(
+            path, f"not a .sog as it should be ({type(error).__name__}: {str(error)[:60]})", "write it again"
+        )
 
 
 def _coded(values: np.ndarray, name: str, alpha: np.ndarray | None = None) -> tuple[bytes, dict[str, Any]]:
@@ -178,19 +180,23 @@ class _Reader:
         entries = archive.infolist()
         for entry in entries:
             if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or entry.flag_bits & 1:
-                refuse(path, f"{entry.filename[:60]} is encrypted or compressed in a rare way", "write it without")
+                raise_input_error(
+                    path, f"{entry.filename[:60]} is encrypted or compressed in a rare way", "write it without"
+                )
         check_expansion(path, sum(entry.file_size for entry in entries), size)
         if archive.getinfo(META).file_size > MOST_META_BYTES:
-            refuse(path, f"{META} is larger than {MOST_META_BYTES} bytes", "write it again")
+            raise_input_error(path, f"{META} is larger than {MOST_META_BYTES} bytes", "write it again")
         try:
             self.meta = json.loads(self._unpacked(META))
         except (ValueError, RecursionError):
-            refuse(path, f"{META} is not valid JSON", "copy or download it again")
+            raise_input_error(path, f"{META} is not valid JSON", "copy or download it again")
         if self.meta["version"] != VERSION:
-            refuse(path, f"version {str(self.meta['version'])[:20]}", f"expected {VERSION}; convert it to that")
+            raise_input_error(
+                path, f"version {str(self.meta['version'])[:20]}", f"expected {VERSION}; convert it to that"
+            )
         self.count = self.meta["count"]
         if type(self.count) is not int or self.count < 1:
-            refuse(path, f"count is {str(self.count)[:20]}", "expected the number of Gaussians")
+            raise_input_error(path, f"count is {str(self.count)[:20]}", "expected the number of Gaussians")
         check_expansion(path, bytes_in_memory(self.count, self._degree()), size)
 
     def _degree(self) -> int:
@@ -199,7 +205,7 @@ class _Reader:
             return 0
         bands: int = self.meta["shN"]["bands"]
         if bands not in (1, 2, 3):
-            refuse(self.path, f"harmonics of degree {str(bands)[:20]}", "expected 1 to 3; write it again")
+            raise_input_error(self.path, f"harmonics of degree {str(bands)[:20]}", "expected 1 to 3; write it again")
         return bands
 
     def _unpacked(self, name: str) -> bytes:
@@ -216,10 +222,10 @@ class _Reader:
         rotations, colours = self._pixels("quats"), self._pixels("sh0")
         for name, pixels in (("quats", rotations), ("sh0", colours)):
             if pixels.shape[1] != 4:
-                refuse(self.path, f"the picture of {name} has no alpha", "write it again")
+                raise_input_error(self.path, f"the picture of {name} has no alpha", "write it again")
         largest = rotations[:, 3].astype(np.int64) - LARGEST_PART
         if largest.min() < 0:
-            refuse(self.path, "a rotation does not say which of its parts is the largest", "write it again")
+            raise_input_error(self.path, "a rotation does not say which of its parts is the largest", "write it again")
         others = (rotations[:, :3] - 127.5) / QUAT_STEPS
         with np.errstate(over="ignore", invalid="ignore"):  # to infinity or NaN, which are refused later
             return Gaussians(
@@ -236,15 +242,17 @@ class _Reader:
             return np.empty((self.count, 0, 3), np.float32)
         sets = self.meta["shN"]["count"]
         if type(sets) is not int or not 1 <= sets <= MOST_SETS:
-            refuse(self.path, f"{str(sets)[:20]} sets of harmonics", f"expected 1 to {MOST_SETS}; write it again")
+            raise_input_error(
+                self.path, f"{str(sets)[:20]} sets of harmonics", f"expected 1 to {MOST_SETS}; write it again"
+            )
         coefficients = (self._degree() + 1) ** 2 - 1
         table = self._decoded("shN", 0, sets * coefficients)
         if table.shape[1] != SETS_A_ROW * coefficients:
-            refuse(self.path, f"the picture of harmonics is {table.shape[1]} pixels wide", "write it again")
+            raise_input_error(self.path, f"the picture of harmonics is {table.shape[1]} pixels wide", "write it again")
         rows = self._pixels("shN", 1).astype(np.int64)
         labels = rows[:, 0] + 256 * rows[:, 1]
         if labels.max() >= sets:
-            refuse(self.path, f"a Gaussian has harmonics {labels.max()} of {sets}", "write it again")
+            raise_input_error(self.path, f"a Gaussian has harmonics {labels.max()} of {sets}", "write it again")
         indices = table[..., :3].reshape(-1, coefficients, 3)
         return self._book("shN")[indices[labels]]
 
@@ -254,7 +262,7 @@ class _Reader:
     def _numbers(self, field: str, name: str, count: int) -> np.ndarray:
         values = np.array(self.meta[field][name], np.float64)
         if values.shape != (count,):
-            refuse(self.path, f"{field}.{name} has shape {values.shape}", f"expected {count} numbers")
+            raise_input_error(self.path, f"{field}.{name} has shape {values.shape}", f"expected {count} numbers")
         return values
 
     def _pixels(self, field: str, index: int = 0) -> np.ndarray:
@@ -271,13 +279,13 @@ class _Reader:
         _, _, kind, _, signature, sides = WEBP.unpack_from(content)
         width, height = (sides & 0x3FFF) + 1, (sides >> 14 & 0x3FFF) + 1
         if kind != b"WEBPVP8L" or signature != WEBP_SIGNATURE:
-            refuse(self.path, f"{str(name)[:60]} is not a lossless WebP picture", "write it again")
+            raise_input_error(self.path, f"{str(name)[:60]} is not a lossless WebP picture", "write it again")
         if not pixels <= width * height <= 2 * pixels + (1 << 16):
-            refuse(self.path, f"{name} has {width}x{height} pixels for {pixels} values", "write it again")
+            raise_input_error(self.path, f"{name} has {width}x{height} pixels for {pixels} values", "write it again")
         try:
             picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
         except cv2.error:
             picture = None
         if picture is None or picture.dtype != np.uint8 or picture.ndim != 3:
-            refuse(self.path, f"{name} is damaged", "copy or download it again")
+            raise_input_error(self.path, f"{name} is damaged", "copy or download it again")
         return picture[..., [2, 1, 0, 3][: picture.shape[2]]]

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import refuse
-from ...geometry.quaternions import unit_quaternions
-from ...system.files import read_bytes, replacing
+from ...errors import raise_input_error
+from ...geometry.quaternions import normalize_quaternions
+from ...system.files import atomic_write, read_bytes
 from ..gaussians import Gaussians, check_finite, check_ranges, with_colours
 from .quantization import clipped_note, round_to_uint8
 
@@ -32,8 +32,8 @@ def write_splat(path: Path, gaussians: Gaussians) -> list[str]:
     records["scale"] = gaussians.scales
     records["rgba"][:, :3] = round_to_uint8(gaussians.colours * 255)
     records["rgba"][:, 3] = round_to_uint8(gaussians.opacities * 255)
-    records["quat"] = round_to_uint8(unit_quaternions(gaussians.quats) * ONE + ZERO)
-    with replacing(path) as temporary:
+    records["quat"] = round_to_uint8(normalize_quaternions(gaussians.quats) * ONE + ZERO)
+    with atomic_write(path) as temporary:
         temporary.write_bytes(records.tobytes())
     lost = ["spherical harmonics above degree 0 left out"] if gaussians.sh_degree else []
     return lost + clipped_note("colours", gaussians.colours, 0, 1)
@@ -43,12 +43,14 @@ def read_splat(path: Path) -> Gaussians:
     """Read a .splat; raises InputError if the file cannot be read, is not one, or holds a value that is none."""
     content = read_bytes(path, "a splat file (.splat)")
     if len(content) % RECORD.itemsize:
-        refuse(path, f"{len(content)} bytes long", "a .splat has 32 bytes for each Gaussian; copy or download it again")
+        raise_input_error(
+            path, f"{len(content)} bytes long", "a .splat has 32 bytes for each Gaussian; copy or download it again"
+        )
     records = np.frombuffer(content, RECORD)
     if (records["scale"] < 0).any():
-        refuse(path, "negative scales", "expected standard deviations; it is not a .splat file, or damaged")
+        raise_input_error(path, "negative scales", "expected standard deviations; it is not a .splat file, or damaged")
     rgba = records["rgba"] / np.float32(255)
-    quats = unit_quaternions((records["quat"] - np.float32(ZERO)) / ONE)
+    quats = normalize_quaternions((records["quat"] - np.float32(ZERO)) / ONE)
     gaussians = with_colours(records["mean"], records["scale"], quats, rgba[:, 3], rgba[:, :3])
     check_finite(path, gaussians)
     return gaussians

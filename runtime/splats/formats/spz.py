@@ -16,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import refuse
-from ...geometry.quaternions import from_smallest_three, smallest_three, unit_quaternions
+from ...errors import raise_input_error
+from ...geometry.quaternions import from_smallest_three, normalize_quaternions, smallest_three
 from ...geometry.sh import SH_0
-from ...system.files import read_bytes, replacing
+from ...system.files import atomic_write, read_bytes
 from ..axes import OPENGL, convert_axes
 from ..gaussians import Gaussians, check_finite, check_ranges
 from .quantization import clipped_note, round_to_uint8
@@ -58,7 +58,7 @@ def write_spz(path: Path, gaussians: Gaussians) -> list[str]:
         round_to_uint8(rest * SH_STEPS + SH_STEPS),
     ]
     compressor = zlib.compressobj(wbits=31)  # gzip's header and trailer
-    with replacing(path) as temporary, temporary.open("wb") as file:
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
         for part in parts:
             file.write(compressor.compress(part if isinstance(part, bytes) else np.ascontiguousarray(part).data))
         file.write(compressor.flush())
@@ -95,7 +95,9 @@ def _fractional_bits(path: Path, means: np.ndarray) -> int:
     """As many bits behind the point as the largest coordinate leaves of 24."""
     largest = float(np.abs(means).max(initial=0))
     if largest > POSITION_LIMIT:
-        refuse(path, f"the scene reaches {largest:g} units", f"a .spz holds {POSITION_LIMIT}; write a .ply instead")
+        raise_input_error(
+            path, f"the scene reaches {largest:g} units", f"a .spz holds {POSITION_LIMIT}; write a .ply instead"
+        )
     bits = MOST_FRACTIONAL_BITS
     while round(largest * 2**bits) > POSITION_LIMIT:
         bits -= 1
@@ -116,7 +118,7 @@ def _unpack_positions(packed: np.ndarray, bits: int) -> np.ndarray:
 
 def _pack_rotations(quats: np.ndarray) -> np.ndarray:
     """Which part of xyzw is the largest in 2 bits, then sign and magnitude of the others in order, 10 bits each."""
-    largest, others = smallest_three(np.roll(unit_quaternions(quats), -1, axis=1))
+    largest, others = smallest_three(np.roll(normalize_quaternions(quats), -1, axis=1))
     packed = largest.astype("<u4")
     for part in others.T:
         magnitude = np.rint(np.abs(part) * QUAT_STEPS).astype("<u4")

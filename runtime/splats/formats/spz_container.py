@@ -5,7 +5,7 @@ import zlib
 from pathlib import Path
 from typing import NamedTuple
 
-from ...errors import InputError, refuse
+from ...errors import InputError, raise_input_error
 from ...system.files import check_expansion
 
 HEADER = struct.Struct("<4sIIBBBB")  # magic, version, Gaussians, SH degree, bits behind the point, flags, and one more
@@ -44,7 +44,7 @@ def unpack(path: Path, content: bytes) -> tuple[Header, bytes]:
         return _unpack_zstd(path, content)
     if content.startswith(GZIP):
         return _unpack_gzip(path, content)
-    refuse(path, "not a .spz file", f"expected {EXPECTED}")
+    raise_input_error(path, "not a .spz file", f"expected {EXPECTED}")
 
 
 def _unpack_gzip(path: Path, content: bytes) -> tuple[Header, bytes]:
@@ -56,9 +56,9 @@ def _unpack_gzip(path: Path, content: bytes) -> tuple[Header, bytes]:
         body = inflater.decompress(inflater.unconsumed_tail, size) if size else b""
         beyond = inflater.decompress(inflater.unconsumed_tail, 1)  # at the end, zlib compares the checksum
     except zlib.error:
-        refuse(path, "the gzip stream is damaged", AGAIN)
+        raise_input_error(path, "the gzip stream is damaged", AGAIN)
     if len(body) < size or not (inflater.eof or beyond):
-        refuse(path, f"cut short: {header.gaussians} Gaussians need {size} bytes", AGAIN)
+        raise_input_error(path, f"cut short: {header.gaussians} Gaussians need {size} bytes", AGAIN)
     return header, body
 
 
@@ -75,19 +75,21 @@ def _unpack_zstd(path: Path, content: bytes) -> tuple[Header, bytes]:
     streams, (start,) = content[HEADER.size - 1], CONTENTS_AT.unpack_from(content.ljust(CONTENTS_AT.size, b"\0"))
     offset = start + streams * CONTENTS_ENTRY.size
     if start < CONTENTS_AT.size or offset > len(content) or streams != len(sizes):
-        refuse(path, f"{streams} streams with their contents at byte {start}", f"expected {len(sizes)}; {AGAIN}")
+        raise_input_error(
+            path, f"{streams} streams with their contents at byte {start}", f"expected {len(sizes)}; {AGAIN}"
+        )
     parts = []
     for index, size in enumerate(sizes):
         packed, unpacked = CONTENTS_ENTRY.unpack_from(content, start + index * CONTENTS_ENTRY.size)
         if unpacked != size:
-            refuse(path, f"stream {index} holds {unpacked} bytes of {size}", AGAIN)
+            raise_input_error(path, f"stream {index} holds {unpacked} bytes of {size}", AGAIN)
         reader = zstandard.ZstdDecompressor(max_window_size=LARGEST_WINDOW)
         try:
             parts.append(reader.stream_reader(content[offset : offset + packed]).read(size))
         except zstandard.ZstdError:
-            refuse(path, f"stream {index} is damaged", AGAIN)
+            raise_input_error(path, f"stream {index} is damaged", AGAIN)
         if len(parts[-1]) < size:
-            refuse(path, f"cut short: stream {index} needs {size} bytes", AGAIN)
+            raise_input_error(path, f"cut short: stream {index} needs {size} bytes", AGAIN)
         offset += packed
     return header, b"".join(parts)
 
@@ -95,16 +97,16 @@ def _unpack_zstd(path: Path, content: bytes) -> tuple[Header, bytes]:
 def _read_header(path: Path, content: bytes, versions: tuple[int, ...]) -> Header:
     """The header at the beginning of the content, once it is one whose numbers we know to read."""
     if len(content) < HEADER.size:
-        refuse(path, "cut short in its header", AGAIN)
+        raise_input_error(path, "cut short in its header", AGAIN)
     magic, version, gaussians, sh_degree, fractional_bits, flags, _ = HEADER.unpack_from(content)
     if magic != MAGIC:
-        refuse(path, "not a .spz file (a gzip stream of something else)", f"expected {EXPECTED}")
+        raise_input_error(path, "not a .spz file (a gzip stream of something else)", f"expected {EXPECTED}")
     if version not in versions:
-        refuse(path, f".spz of version {version}", "expected version 2 to 4; write it as one of those")
+        raise_input_error(path, f".spz of version {version}", "expected version 2 to 4; write it as one of those")
     if sh_degree > 3:
-        refuse(path, f"SH degree {sh_degree}", "expected 0 to 3; write it with one of those")
+        raise_input_error(path, f"SH degree {sh_degree}", "expected 0 to 3; write it with one of those")
     if fractional_bits > MOST_FRACTIONAL_BITS:
-        refuse(path, f"{fractional_bits} bits behind the point", f"expected at most {MOST_FRACTIONAL_BITS}")
+        raise_input_error(path, f"{fractional_bits} bits behind the point", f"expected at most {MOST_FRACTIONAL_BITS}")
     if flags & HAS_EXTENSIONS:
-        refuse(path, "has extensions, which may change its axes", "write it without them")
+        raise_input_error(path, "has extensions, which may change its axes", "write it without them")
     return Header(version, gaussians, sh_degree, fractional_bits)

@@ -28,7 +28,7 @@ from camera_cases import (
     write_stereo,
 )
 from idesplat.runtime.cameras.camera import Camera
-from idesplat.runtime.cameras.io import CameraFormat, read_cameras, recognise, write_cameras
+from idesplat.runtime.cameras.io import CameraFormat, detect_format, read_cameras, write_cameras
 from idesplat.runtime.errors import InputError
 
 # ---- transforms.json: our writer against the reader; test_cameras.py writes it by hand
@@ -42,9 +42,9 @@ def test_both_json_files_are_read_as_written(tmp_path, distortion, fisheye):
     cameras = known(["a/0.png", "a/1.png"], distortion=distortion, fisheye=fisheye)
     for name, form in (("cameras.json", CameraFormat.OWN), ("transforms.json", CameraFormat.TRANSFORMS)):
         write_cameras(tmp_path / name, cameras)
-        assert recognise(tmp_path / name) is form
+        assert detect_format(tmp_path / name) is form
         assert_same(read_cameras(tmp_path / name), cameras)
-    assert recognise(tmp_path) is CameraFormat.TRANSFORMS
+    assert detect_format(tmp_path) is CameraFormat.TRANSFORMS
     assert_same(read_cameras(tmp_path), cameras)
 
 
@@ -90,7 +90,7 @@ def test_colmap_cameras(tmp_path, model):
     matrix = np.array([[510.25, 0, 301.5], [0, fy, 251.125], [0, 0, 1]])
     cameras = known(["b/0.jpg", "b/1.jpg", "c.jpg"], matrix, distortion=distortion, fisheye=fisheye)
     colmap_model(cameras, model, parameters).write_binary(tmp_path)
-    assert recognise(tmp_path) is CameraFormat.COLMAP
+    assert detect_format(tmp_path) is CameraFormat.COLMAP
     assert_same(read_cameras(tmp_path), cameras)
 
 
@@ -157,7 +157,7 @@ def test_colmap_mistakes(tmp_path, monkeypatch):
     for number in "01":
         (tmp_path / "two" / number / "points3D.bin").unlink()
     with pytest.raises(InputError, match="expected the files cameras, images, points3D"):
-        read_cameras(tmp_path / "two", form=CameraFormat.COLMAP)
+        read_cameras(tmp_path / "two", camera_format=CameraFormat.COLMAP)
     pycolmap.Reconstruction().write_binary(tmp_path)
     with pytest.raises(InputError, match="no registered image"):
         read_cameras(tmp_path)
@@ -172,8 +172,8 @@ def test_colmap_mistakes(tmp_path, monkeypatch):
 def test_re10k(tmp_path):
     cameras = known(["52553000", "52586000", "52619000"])
     (tmp_path / "0000cc6d8b108390.txt").write_text(as_re10k(cameras))
-    assert recognise(tmp_path / "0000cc6d8b108390.txt") is CameraFormat.RE10K
-    with pytest.raises(InputError, match=r"no picture is named by one of its 3 timestamps.*--images"):
+    assert detect_format(tmp_path / "0000cc6d8b108390.txt") is CameraFormat.RE10K
+    with pytest.raises(InputError, match=r"no image is named by one of its 3 timestamps.*--images"):
         read_cameras(tmp_path / "0000cc6d8b108390.txt")
     pictures = save_pictures(tmp_path / "frames", ["52586000.png", "52619000.png"])
     assert_same(read_cameras(tmp_path / "0000cc6d8b108390.txt", pictures), cameras)
@@ -186,7 +186,7 @@ def test_re10k(tmp_path):
 def test_llff(tmp_path):
     cameras = known(["IMG_10.png", "IMG_2.png"], CENTRED)  # LLFF sorts character by character
     np.save(tmp_path / "poses_bounds.npy", as_llff(cameras))
-    assert recognise(tmp_path / "poses_bounds.npy") is CameraFormat.LLFF
+    assert detect_format(tmp_path / "poses_bounds.npy") is CameraFormat.LLFF
     assert [camera.name for camera in read_cameras(tmp_path)] == ["000", "001"]
     pictures = save_pictures(tmp_path / "images", ["IMG_2.png", "IMG_10.png"])
     for given in ([], pictures, pictures[:1]):
@@ -220,7 +220,7 @@ def test_cam_txt(tmp_path, depths, expected):
     with pytest.raises(InputError, match=r"00000000_cam\.txt: gives no size in pixels.*--images"):
         read_cameras(tmp_path / "cams")
     save_pictures(tmp_path / "images", [camera.name for camera in cameras])
-    assert recognise(tmp_path / "cams") is recognise(tmp_path / "cams" / "00000003_cam.txt") is CameraFormat.DTU
+    assert detect_format(tmp_path / "cams") is detect_format(tmp_path / "cams" / "00000003_cam.txt") is CameraFormat.DTU
     read = read_cameras(tmp_path / "cams")
     assert_same(read, cameras)
     assert read[0].depth_range == expected
@@ -261,7 +261,7 @@ def assert_stereo(cameras):
 def test_stereo_calibration(tmp_path, suffix, size):
     path = tmp_path / f"stereo{suffix}"
     write_stereo(path, size=size)
-    assert recognise(path) is CameraFormat.OPENCV
+    assert detect_format(path) is CameraFormat.OPENCV
     pictures = save_pictures(tmp_path / "pair", ["im0.png", "im1.png"])
     cameras = read_cameras(path, pictures)
     assert [camera.name for camera in cameras] == ["im0.png", "im1.png"]
@@ -289,7 +289,7 @@ def test_stereo_calibration_in_two_files(tmp_path):
     start, end = text.index("R: !!opencv"), text.index("image_width")
     (tmp_path / "extrinsics.yml").write_text("%YAML:1.0\n---\n" + text[start:end])
     with pytest.raises(InputError, match="gives no imageSize"):
-        read_cameras(tmp_path / "extrinsics.yml", form=CameraFormat.OPENCV)
+        read_cameras(tmp_path / "extrinsics.yml", camera_format=CameraFormat.OPENCV)
     (tmp_path / "intrinsics.yml").write_text(text[:start] + text[end:])
     for name in ("intrinsics.yml", "extrinsics.yml"):
         assert_stereo(read_cameras(tmp_path / name))

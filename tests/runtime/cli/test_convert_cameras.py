@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from camera_cases import CENTRED, as_llff, as_re10k, assert_same, colmap_model, known, save_pictures
 from conftest import run_command
-from idesplat.runtime.cameras.io import CameraFormat, read_cameras, recognise
+from idesplat.runtime.cameras.io import CameraFormat, detect_format, read_cameras
 from idesplat.runtime.cli.cameras import main
 
 
@@ -23,7 +23,7 @@ def test_colmap_to_both_jsons(folder, capsys):
     for name, form in (("cameras.json", CameraFormat.OWN), ("out/transforms.json", CameraFormat.TRANSFORMS)):
         Path("out").mkdir(exist_ok=True)
         assert run_command(main, "convert", ".", name) == 0
-        assert recognise(Path(name)) is form
+        assert detect_format(Path(name)) is form
         assert_same(read_cameras(Path(name)), cameras)
     printed = capsys.readouterr().out
     assert "read 2 cameras as colmap: 2 of 640 x 480, focal length 510.2, no distortion" in printed

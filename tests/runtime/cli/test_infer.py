@@ -18,7 +18,7 @@ from idesplat.runtime.cli.view import main as view_main
 from idesplat.runtime.inference.inputs import pick_frames
 from idesplat.runtime.splats.formats.ply import read_ply
 from idesplat.runtime.splats.io import read_splats
-from idesplat.runtime.system.files import replacing
+from idesplat.runtime.system.files import atomic_write
 from idesplat.tools.synthetic.make_scene import make_scene
 
 
@@ -338,7 +338,7 @@ BAD = {
 def test_bad_input_is_one_line_and_leaves_nothing(workplace, capfd, name):
     spoil, arguments, expected = BAD[name]
     spoil()
-    with Outputs("idesplat-infer"), replacing(Path("scene.ply")) as temporary:
+    with Outputs("idesplat-infer"), atomic_write(Path("scene.ply")) as temporary:
         temporary.write_bytes(b"the result of yesterday")
     before = {path: path.stat().st_mtime_ns for path in workplace.rglob("*")}
     options = dict(zip(USUAL[::2], USUAL[1::2], strict=True)) | dict(zip(arguments[::2], arguments[1::2], strict=True))

@@ -17,8 +17,8 @@ from idesplat.runtime.cli.outputs import Outputs, name_files, outputs, write_jso
 from idesplat.runtime.cli.render import main as render
 from idesplat.runtime.cli.view import main as view
 from idesplat.runtime.errors import InputError
-from idesplat.runtime.system.files import replacing
-from idesplat.runtime.system.written_files import LEAST_STALE_LINES, read_record
+from idesplat.runtime.system.files import atomic_write
+from idesplat.runtime.system.output_records import LEAST_STALE_LINES, read_record
 from scene_files import pinholes, snapshot, write_scene
 
 FIRST, SECOND = "000.png", "001.png"
@@ -278,16 +278,16 @@ def test_a_benchmark_leaves_what_is_not_its_own(dataset, exported, capfd):
 def test_what_was_not_announced_is_checked_when_it_is_written(tmp_path):
     mine = tmp_path / "mine.txt"
     mine.write_text("the user's own")
-    with pytest.raises(InputError, match="exists"), Outputs("test"), replacing(mine) as temporary:
+    with pytest.raises(InputError, match="exists"), Outputs("test"), atomic_write(mine) as temporary:
         temporary.write_text("lost")
     assert mine.read_text() == "the user's own"
-    with replacing(mine) as temporary:  # a library, not a command
+    with atomic_write(mine) as temporary:  # a library, not a command
         temporary.write_text("as the caller wants")
     assert mine.read_text() == "as the caller wants"
 
 
 def write(path, text="something"):
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(text)
 
 

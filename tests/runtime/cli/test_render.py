@@ -18,8 +18,8 @@ from idesplat.runtime.cli.render import main
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.geometry.trajectories import interpolate_extrinsics, orbit_extrinsics
 from idesplat.runtime.images import video_writer as video_out
+from idesplat.runtime.images.png import save_depth_png, save_png
 from idesplat.runtime.images.video_writer import open_video
-from idesplat.runtime.images.writing import save_depth_png, save_png
 from idesplat.runtime.rendering.cameras import around, fitted, overview
 from idesplat.runtime.rendering.rasterizer import rasterize
 from idesplat.runtime.rendering.render import render_view

@@ -13,8 +13,8 @@ from conftest import run_command
 from idesplat.runtime.cameras.camera import Camera
 from idesplat.runtime.cameras.io import read_cameras, write_cameras
 from idesplat.runtime.cli.view import main, read_viewpoints
-from idesplat.runtime.geometry.quaternions import quaternions_from_matrices
-from idesplat.runtime.images.writing import save_png
+from idesplat.runtime.geometry.quaternions import matrices_to_quaternions
+from idesplat.runtime.images.png import save_png
 from idesplat.runtime.rendering.cameras import overview
 from idesplat.runtime.rendering.render import render_view
 from idesplat.runtime.splats.formats.ply import write_ply
@@ -56,7 +56,7 @@ def gaussians(camera: Camera) -> Gaussians:
     local = np.concatenate([front, wall, ball])  # not in the order in which they are to be drawn
     scales = rng.uniform(0.5, 1.2, local.shape) * [1, 1, 0.1]
     turned = np.stack([cv2.Rodrigues(vector)[0] for vector in rng.normal(size=(len(local), 3)) * 0.3])
-    quats = quaternions_from_matrices(camera.extrinsics[:3, :3] @ turned)
+    quats = matrices_to_quaternions(camera.extrinsics[:3, :3] @ turned)
     means = local @ camera.extrinsics[:3, :3].T + camera.extrinsics[:3, 3]
     return with_colours(means, scales, quats, rng.uniform(0.6, 1, len(local)), colours)
 

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from idesplat.runtime.cameras.camera import Camera
-from idesplat.runtime.cameras.undistortion import seen_by_lens, undistort
+from idesplat.runtime.cameras.undistortion import undistort, undistortion_valid_mask
 from idesplat.runtime.errors import InputError
-from idesplat.runtime.images.io import describe_unread, find_images, load_image, unread_images
-from idesplat.runtime.images.resizing import cover, fit
+from idesplat.runtime.images.io import describe_unsupported, find_images, load_image, unsupported_images
+from idesplat.runtime.images.resizing import cover_crop, resize_and_crop
 
 # rows of the upright picture, in RGB: red, green / blue, white / grey, black
 UPRIGHT = np.array(
@@ -97,11 +97,11 @@ def test_a_file_is_found_once_under_any_path(tmp_path):
 def test_images_that_are_not_read_are_named(tmp_path):
     touch(tmp_path, "1.jpg", "2.heic", "IMG_2.DNG", "IMG_1.cr2", "a.gif", "z.nef", "._x.dng", "notes.txt", "data.npz")
     assert [path.name for path in find_images([tmp_path])] == ["1.jpg", "2.heic"]
-    assert [path.name for path in unread_images([tmp_path])] == ["a.gif", "IMG_1.cr2", "IMG_2.DNG", "z.nef"]
-    assert describe_unread([str(tmp_path / "I*")]) == [
+    assert [path.name for path in unsupported_images([tmp_path])] == ["a.gif", "IMG_1.cr2", "IMG_2.DNG", "z.nef"]
+    assert describe_unsupported([str(tmp_path / "I*")]) == [
         "2 images are of a format that is not read, and left out: IMG_1.cr2, IMG_2.DNG; save as JPEG or PNG"
     ]
-    assert describe_unread([tmp_path / "1.jpg"]) == []
+    assert describe_unsupported([tmp_path / "1.jpg"]) == []
 
 
 # ---- reading
@@ -217,10 +217,10 @@ def test_fit_keeps_every_projection(width, height, target_width, target_height):
     K = np.array([[focal, 0, 0.47 * width], [0, 1.02 * focal, 0.55 * height], [0, 0, 1]])
     sigma = 0.016 * min(width, height)
     image = blobs(height, width, project(K), sigma)
-    fitted, intrinsics = fit(image, K, target_height, target_width)
+    fitted, intrinsics = resize_and_crop(image, K, target_height, target_width)
     assert fitted.shape == (3, target_height, target_width) and fitted.dtype == np.float32
     assert fitted.min() >= 0 and fitted.max() <= 1 and intrinsics.dtype == np.float32
-    crop = cover(width, height, target_width, target_height)
+    crop = cover_crop(width, height, target_width, target_height)
     radius = 4.5 * sigma * crop.scale_x
     centres = project(np.diag([target_width, target_height, 1]) @ intrinsics.astype(np.float64))
     inside = [
@@ -258,8 +258,8 @@ def test_what_the_lens_saw_against_opencv_projection():
     # the photograph has no colour beyond its outermost pixel centres
     expected = ((bent > 0.5) & (bent < (95.5, 71.5))).all(axis=-1)
     assert 0.5 < expected.mean() < 0.95
-    assert (seen_by_lens(camera) == expected).mean() > 0.999
-    assert seen_by_lens(replace(camera, distortion=None)).all()
+    assert (undistortion_valid_mask(camera) == expected).mean() > 0.999
+    assert undistortion_valid_mask(replace(camera, distortion=None)).all()
 
 
 def test_undistort_fisheye_against_opencv_projection():
@@ -288,7 +288,7 @@ def test_undistort_without_distortion_changes_nothing():
 @given(*(st.integers(1, 3000) for _ in range(4)))
 @settings(max_examples=200)
 def test_cover_always_covers_and_cuts_one_side_only(width, height, target_width, target_height):
-    crop = cover(width, height, target_width, target_height)
+    crop = cover_crop(width, height, target_width, target_height)
     assert crop.left >= 0 and crop.left + target_width <= crop.width
     assert crop.top >= 0 and crop.top + target_height <= crop.height
     assert crop.width == target_width or crop.height == target_height

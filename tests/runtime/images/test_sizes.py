@@ -3,7 +3,7 @@
 import pytest
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.images.sizes import parse_size
-from idesplat.runtime.system.limits import whole_number
+from idesplat.runtime.system.limits import parse_whole_number
 
 
 def test_sizes():
@@ -28,6 +28,6 @@ def test_sizes_have_a_limit_that_can_be_raised(monkeypatch):
 
 
 def test_whole_numbers_are_ascii():
-    assert whole_number("007") == 7
+    assert parse_whole_number("007") == 7
     for text in ("", "²", "٣", "1 ", "+1", "-1", "1e3", "9" * 19):
-        assert whole_number(text) is None
+        assert parse_whole_number(text) is None

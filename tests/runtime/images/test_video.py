@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 from idesplat.runtime.errors import InputError
-from idesplat.runtime.images import video
+from idesplat.runtime.images import video_reader as video
 from idesplat.runtime.images.io import load_image
 
 
@@ -30,22 +30,24 @@ def test_sharp_frames_at_even_steps(clip, tmp_path, monkeypatch):
     monkeypatch.setattr(video, "FRAMES", 12)
     out = tmp_path / "frames"
     out.mkdir()
-    files = video.sample_frames(clip, out)
+    files = video.extract_sharp_frames(clip, out)
     assert [file.name for file in files] == [f"clip-{number:06}.png" for number in range(3, 60, 5)]
     assert greys(files) == list(range(3, 60, 5))
 
 
 def test_named_frames_by_number_and_by_time(clip, tmp_path):
-    files = video.named_frames(clip, ["images/clip-000007.png", "clip-000040", "other-000001.png"], tmp_path)
+    files = video.extract_named_frames(clip, ["images/clip-000007.png", "clip-000040", "other-000001.png"], tmp_path)
     assert [file.name for file in files] == ["clip-000007.png", "clip-000040.png"]
     assert greys(files) == [7, 40]
-    files = video.named_frames(clip, ["100000", "1000000", "1500000"], tmp_path)  # microseconds, 30 frames a second
+    files = video.extract_named_frames(
+        clip, ["100000", "1000000", "1500000"], tmp_path
+    )  # microseconds, 30 frames a second
     assert [file.name for file in files] == ["100000.png", "1000000.png", "1500000.png"]
     assert greys(files) == [3, 30, 45]
 
 
 def test_named_frames_are_not_too_many(clip, tmp_path):
-    files = video.named_frames(clip, [f"clip-{number:06}" for number in range(60)], tmp_path)
+    files = video.extract_named_frames(clip, [f"clip-{number:06}" for number in range(60)], tmp_path)
     assert len(files) == video.FRAMES
     assert greys(files)[0] == 0 and greys(files)[-1] == 59
 
@@ -60,13 +62,13 @@ def test_mistakes(clip, tmp_path):
         ("absent.mp4", "no such file"),
     ):
         with pytest.raises(InputError, match=expected):
-            video.sample_frames(tmp_path / name, tmp_path)
+            video.extract_sharp_frames(tmp_path / name, tmp_path)
     with pytest.raises(InputError, match=r"clip\.avi: the cameras do not name its frames, such as clip-000000\.png"):
-        video.named_frames(clip, ["a.png", "other-000003.png"], tmp_path)
+        video.extract_named_frames(clip, ["a.png", "other-000003.png"], tmp_path)
     with pytest.raises(InputError, match="the cameras do not name its frames"):  # but photographs of another capture
-        video.named_frames(clip, ["0001.jpg", "0002.jpg", "0007.jpg"], tmp_path)
+        video.extract_named_frames(clip, ["0001.jpg", "0002.jpg", "0007.jpg"], tmp_path)
     with pytest.raises(InputError, match=r"damaged|expected two at least"):
-        video.sample_frames(tmp_path / "cut.avi", tmp_path)
+        video.extract_sharp_frames(tmp_path / "cut.avi", tmp_path)
 
 
 def test_frames_larger_than_the_limit_are_refused(tmp_path, monkeypatch):
@@ -76,10 +78,10 @@ def test_frames_larger_than_the_limit_are_refused(tmp_path, monkeypatch):
     writer.release()
     monkeypatch.setenv("IDESPLAT_MAX_MEGAPIXELS", "1")
     with pytest.raises(InputError, match=r"large\.avi: has 1200 x 900 pixels, .*IDESPLAT_MAX_MEGAPIXELS"):
-        video.sample_frames(tmp_path / "large.avi", tmp_path)
+        video.extract_sharp_frames(tmp_path / "large.avi", tmp_path)
 
 
 def test_names_of_cameras_are_no_numbers_of_any_length(clip, tmp_path):
     names = ["clip-" + "9" * 5000, "9" * 5000, "²", "clip-000003", "clip-000005"]
-    files = video.named_frames(clip, names, tmp_path)
+    files = video.extract_named_frames(clip, names, tmp_path)
     assert [file.name for file in files] == ["clip-000003.png", "clip-000005.png"]

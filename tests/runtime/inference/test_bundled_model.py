@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from idesplat import InputError, Predictor, read_cameras
 from idesplat.runtime.inference import bundled_model as module
-from idesplat.runtime.views.batch import prepare
+from idesplat.runtime.views.batch import build_view_batch
 
 LARGEST = 16_000_000  # bytes
 
@@ -38,7 +38,7 @@ def test_finds_depth_far_better_than_one_plane_does(scene):
     cameras = read_cameras(scene / "transforms.json")
     pairs = [(scene / cameras[view].name, cameras[view]) for view in (1, 3)]
     height, width = cameras[0].height, cameras[0].width
-    views = prepare(pairs, None, height, width)
+    views = build_view_batch(pairs, None, height, width)
     predictor = Predictor(module.bundled_model())
     span = predictor.depth_range(views)
     found = predictor.predict_arrays(views.images, views.extrinsics, views.intrinsics, span.near, span.far).depth

@@ -12,11 +12,11 @@ from conftest import run_command
 from idesplat.runtime.cameras.camera import Camera
 from idesplat.runtime.cameras.io import write_cameras
 from idesplat.runtime.cli.infer import main
-from idesplat.runtime.images.resizing import cover
+from idesplat.runtime.images.resizing import cover_crop
 from idesplat.runtime.inference.colmap_workspace import normals_of, workspace_files, write_workspace
 from idesplat.runtime.inference.depth_maps import write_depth_maps
 from idesplat.runtime.inference.predictor import Prediction
-from idesplat.runtime.views.batch import Views, prepare
+from idesplat.runtime.views.batch import ViewBatch, build_view_batch
 from tiny_model import write_model
 
 HEIGHT, WIDTH = 64, 96
@@ -50,7 +50,7 @@ def original_cameras(count: int) -> list[Camera]:
     return cameras
 
 
-def plane(count: int = 6) -> tuple[Views, Prediction]:
+def plane(count: int = 6) -> tuple[ViewBatch, Prediction]:
     """Views of the plane, and its true depth as if it had been predicted."""
     originals = original_cameras(count)
     cameras = [
@@ -63,7 +63,7 @@ def plane(count: int = 6) -> tuple[Views, Prediction]:
     intrinsics = np.stack([np.diag([1 / WIDTH, 1 / HEIGHT, 1]) @ camera.K for camera in cameras])
     names = [Path(camera.name).name for camera in originals]
     extrinsics = np.stack([camera.extrinsics for camera in cameras])
-    views = Views(names, np.stack(images).astype(np.float32), extrinsics, intrinsics.astype(np.float32), originals)
+    views = ViewBatch(names, np.stack(images).astype(np.float32), extrinsics, intrinsics.astype(np.float32), originals)
     return views, Prediction(depth.astype(np.float32), None, {}, cameras)
 
 
@@ -101,7 +101,7 @@ def test_an_archive_says_where_in_the_photograph_it_lies(tmp_path: Path) -> None
             assert (float(file["near"]), float(file["far"])) == (1, 20)
             assert file["offset"].tolist() == [1e5, 0, 0]
             assert file["depth"].dtype == np.float32
-    assert cover(FULL_WIDTH, FULL_HEIGHT, WIDTH, HEIGHT).matrix.tolist() == CROP.tolist()
+    assert cover_crop(FULL_WIDTH, FULL_HEIGHT, WIDTH, HEIGHT).matrix.tolist() == CROP.tolist()
 
 
 def test_normals_are_the_planes() -> None:
@@ -179,7 +179,7 @@ COMMAND = ("--images", "images", "--cameras", "cameras.json", "--model", "model.
 def test_the_command_saves_what_leads_back(workplace: Path) -> None:
     assert run_command(main, *COMMAND, "--views", "3", "--save-depth", "depth", "--near", "1", "--far", "9") == 0
     cameras = original_cameras(3)
-    views = prepare([(Path(camera.name), camera) for camera in cameras], None, HEIGHT, WIDTH)
+    views = build_view_batch([(Path(camera.name), camera) for camera in cameras], None, HEIGHT, WIDTH)
     for index, camera in enumerate(cameras):
         with np.load(f"depth/view {index}.npz") as file:
             np.testing.assert_allclose(file["K"], np.diag([WIDTH, HEIGHT, 1]) @ views.intrinsics[index], rtol=1e-6)

@@ -16,7 +16,7 @@ from idesplat.runtime.sfm import estimate
 from idesplat.runtime.views import depth_range
 from idesplat.runtime.views import loader as view_loader
 from idesplat.runtime.views import sources as photographs
-from idesplat.runtime.views.depth_range import find_depth_range
+from idesplat.runtime.views.depth_range import estimate_depth_range
 from idesplat.tools.synthetic.make_scene import make_scene
 from PIL import ImageFile
 
@@ -90,14 +90,14 @@ def counted(monkeypatch) -> Counter:
     monkeypatch.setattr(cv2, "imdecode", counting("decoded", cv2.imdecode))
     monkeypatch.setattr(ImageFile.ImageFile, "load", counting("decoded", ImageFile.ImageFile.load))
     for module in (view_loader, depth_range, estimate):
-        monkeypatch.setattr(module, "find_features", counting("sift", module.find_features))
+        monkeypatch.setattr(module, "extract_features", counting("sift", module.extract_features))
     return counter
 
 
 def ranged(inputs):
     views = inputs.views
     arrays = views.images, views.extrinsics, views.intrinsics
-    return find_depth_range(*arrays, views.cameras, (1.0, 100.0), samples=views.samples)
+    return estimate_depth_range(*arrays, views.cameras, (1.0, 100.0), feature_images=views.feature_images)
 
 
 def test_an_image_is_decoded_once_and_only_if_it_is_used(capture, counted):
@@ -151,16 +151,16 @@ def test_estimating_leaves_out_damaged_images_and_copies(large, tmp_path):
     first, second, last = sorted(images.iterdir())
     second.write_bytes(second.read_bytes()[:100])
     shutil.copy(first, images / "copy.png")
-    left_out: list[str] = []
-    with pytest.raises(InputError, match=r"1 photograph that can be used \(.*is damaged"):
-        estimate.estimate_cameras([first, second], focal, left_out)
-    with pytest.raises(InputError, match=r"1 photograph that can be used \(.*copy\.png: is the same image as .*000"):
-        estimate.estimate_cameras([first, images / "copy.png"], focal, left_out)
+    skipped: list[str] = []
+    with pytest.raises(InputError, match=r"1 image that can be used \(.*is damaged"):
+        estimate.estimate_cameras([first, second], focal, skipped)
+    with pytest.raises(InputError, match=r"1 image that can be used \(.*copy\.png: is the same image as .*000"):
+        estimate.estimate_cameras([first, images / "copy.png"], focal, skipped)
     with pytest.raises(InputError, match="is damaged"):
         estimate.estimate_cameras([first, second, last], focal)
-    cameras = estimate.estimate_cameras([first, second, images / "copy.png", last], focal, left_out)
+    cameras = estimate.estimate_cameras([first, second, images / "copy.png", last], focal, skipped)
     assert [camera.name for camera in cameras] == [str(first), str(last)]
-    assert [line.partition(":")[0] for line in left_out] == [str(second), str(images / "copy.png")]
+    assert [line.partition(":")[0] for line in skipped] == [str(second), str(images / "copy.png")]
 
 
 def test_unread_formats_are_said(capture):
@@ -174,7 +174,7 @@ def test_unread_formats_are_said(capture):
 
 
 def named(cameras: Path, folder: Path) -> list[Path]:
-    return photographs.find_photographs([], cameras, None, folder)
+    return photographs.find_input_images([], cameras, None, folder)
 
 
 def test_cameras_name_their_images(capture):
@@ -197,7 +197,7 @@ def test_images_beside_the_file_and_names_without_suffix(capture):
     with pytest.raises(InputError, match=r"transforms\.json: none of the 8 images that it names .* give --images"):
         named(capture / "transforms.json", capture)
     with pytest.raises(InputError, match="--images is missing"):
-        photographs.find_photographs([], None, None, capture)
+        photographs.find_input_images([], None, None, capture)
 
 
 def test_colmap_models_find_their_images(capture):

@@ -12,7 +12,7 @@ from idesplat.export.stages import example_inputs
 from idesplat.runtime.images.io import load_image
 from idesplat.runtime.inference.metadata import INPUTS
 from idesplat.runtime.inference.session import open_session, provider_name
-from idesplat.runtime.views.batch import prepare
+from idesplat.runtime.views.batch import build_view_batch
 
 ROOT = Path(__file__).parent.parent.parent.parent
 
@@ -73,7 +73,7 @@ def test_images_that_may_mean_anything_are_refused(predictor, scene, change):
 def test_without_near_and_far_the_unit_does_not_matter(predictor, scene):
     """A scene in millimetres: the model's own range, 0.5 to 100, would end before the nearest wall."""
     cameras = read_cameras(scene / "transforms.json")[:2]
-    views = prepare([(scene / camera.name, camera) for camera in cameras], None, 64, 96)
+    views = build_view_batch([(scene / camera.name, camera) for camera in cameras], None, 64, 96)
     arrays = views.images, views.extrinsics, views.intrinsics
     expected = predictor.predict_arrays(*arrays)
     millimetres = views.extrinsics.copy()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from idesplat.runtime.cameras.io import read_cameras
 from idesplat.runtime.errors import InputError
-from idesplat.runtime.images.exif import exif_focal, given_focal
+from idesplat.runtime.images.exif import exif_focal, parse_focal
 from idesplat.runtime.images.io import load_image
 from idesplat.runtime.sfm.estimate import estimate_cameras
 from idesplat.tools.synthetic.make_scene import make_scene
@@ -88,11 +88,11 @@ def test_exif_tells_the_focal_length(room, tmp_path):
 
 
 def test_given_focal_lengths():
-    assert given_focal("1375.5", 1080, 1920) == 1375.5
-    assert given_focal("36mm", 3600, 2400) == pytest.approx(3600)  # 36 mm is as wide as the film
+    assert parse_focal("1375.5", 1080, 1920) == 1375.5
+    assert parse_focal("36mm", 3600, 2400) == pytest.approx(3600)  # 36 mm is as wide as the film
     for text in ("", "mm", "-5", "0", "0mm", "26 cm", "1e3", "nan"):
         with pytest.raises(InputError, match="expected pixels"):
-            given_focal(text, 100, 100)
+            parse_focal(text, 100, 100)
 
 
 def save(path, rgb):
@@ -123,7 +123,7 @@ def test_refusals(room, tmp_path, monkeypatch):
             estimate_cameras(pictures, given)
         assert "\n" not in str(caught.value)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"3 photographs need pycolmap \(pip install .*--frames"):
+    with pytest.raises(InputError, match=r"3 images need pycolmap \(pip install .*--frames"):
         estimate_cameras([first, second, blank], focal)
 
 

@@ -7,8 +7,8 @@ import pytest
 from idesplat.runtime.cameras.camera import Camera
 from idesplat.runtime.cameras.io import read_cameras
 from idesplat.runtime.errors import InputError
-from idesplat.runtime.geometry.consistency import confidence, depth_jumps
-from idesplat.runtime.geometry.quaternions import quaternions_from_matrices, rotation_matrices
+from idesplat.runtime.geometry.consistency import depth_jumps, multi_view_consistency
+from idesplat.runtime.geometry.quaternions import matrices_to_quaternions, quaternions_to_matrices
 from idesplat.runtime.geometry.sh import SH_0
 from idesplat.runtime.images.io import load_image
 from idesplat.runtime.rendering.render import render_view
@@ -102,7 +102,7 @@ def test_confidence_worked_by_hand() -> None:
     depth = wall()
     depth[0, 4:8, 8:12] = 1.0  # a board in the air, which the second camera would see: 8 columns to the left, at 0 to 3
     points = points_from_depth(depth, np.zeros((2, 3, HEIGHT, WIDTH)), extrinsics, INTRINSICS).positions
-    given = confidence(points.reshape(2, HEIGHT, WIDTH, 3), depth, extrinsics, INTRINSICS)
+    given = multi_view_consistency(points.reshape(2, HEIGHT, WIDTH, 3), depth, extrinsics, INTRINSICS)
     expected = np.ones((2, HEIGHT, WIDTH))
     expected[0, 4:8, 8:12] = 0  # the second camera sees the wall through it
     np.testing.assert_array_equal(
@@ -120,7 +120,7 @@ def test_what_is_too_far_is_denied_by_what_sees_nearer() -> None:
     depth = wall()
     depth[0, 4:8, 8:12] = 4.0  # a hole: the second camera's wall there stands where the first sees through
     points = points_from_depth(depth, np.zeros((2, 3, HEIGHT, WIDTH)), extrinsics, INTRINSICS).positions
-    given = confidence(points.reshape(2, HEIGHT, WIDTH, 3), depth, extrinsics, INTRINSICS)
+    given = multi_view_consistency(points.reshape(2, HEIGHT, WIDTH, 3), depth, extrinsics, INTRINSICS)
     assert (given[0] == 1).all()  # behind the second camera's surface, which therefore does not judge
     hidden = np.zeros((HEIGHT, WIDTH), bool)
     hidden[5:7, 9 - 4 : 11 - 4] = True  # inside the hole, away from its rim
@@ -174,12 +174,12 @@ def test_merging_keeps_the_moments() -> None:
     members = [0, 1, 4]
     weight = gaussians.opacities[members] / gaussians.opacities[members].sum()
     mean = weight @ gaussians.means[members]
-    axes = rotation_matrices(gaussians.quats) * gaussians.scales[:, None, :]
+    axes = quaternions_to_matrices(gaussians.quats) * gaussians.scales[:, None, :]
     covariance = sum(
         w * (axes[m] @ axes[m].T + np.outer(gaussians.means[m] - mean, gaussians.means[m] - mean))
         for w, m in zip(weight, members, strict=True)
     )
-    ours = rotation_matrices(result.quats[:1])[0] * result.scales[0]
+    ours = quaternions_to_matrices(result.quats[:1])[0] * result.scales[0]
     np.testing.assert_allclose(result.means[0], mean, atol=1e-6)
     np.testing.assert_allclose(ours @ ours.T, covariance, atol=1e-5)
     np.testing.assert_allclose(result.opacities[0], 1 - 0.8 * 0.1 * 0.7, atol=1e-6)
@@ -191,8 +191,8 @@ def test_merging_keeps_the_moments() -> None:
 def test_quaternions_and_matrices() -> None:
     quats = np.random.default_rng(0).normal(size=(200, 4))
     quats[:4] = np.eye(4)  # no turn, and half turns around the axes
-    matrices = rotation_matrices(quats)
-    np.testing.assert_allclose(rotation_matrices(quaternions_from_matrices(matrices)), matrices, atol=1e-12)
+    matrices = quaternions_to_matrices(quats)
+    np.testing.assert_allclose(quaternions_to_matrices(matrices_to_quaternions(matrices)), matrices, atol=1e-12)
 
 
 def test_the_line_names_and_counts() -> None:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from idesplat.runtime.geometry.quaternions import from_smallest_three, smallest_three, unit_quaternions
+from idesplat.runtime.geometry.quaternions import from_smallest_three, normalize_quaternions, smallest_three
 from idesplat.runtime.rendering.rasterizer import rasterize
 from idesplat.runtime.splats.axes import GLTF, OPENGL, convert_axes
 from idesplat.runtime.splats.formats import codebooks
@@ -40,7 +40,7 @@ def test_a_half_turn_is_a_rotation_of_the_whole_scene(truth: Gaussians, signs: t
 
 
 def test_smallest_three_and_back() -> None:
-    quats = unit_quaternions(np.random.default_rng(0).normal(size=(500, 4)) * 1e-9)
+    quats = normalize_quaternions(np.random.default_rng(0).normal(size=(500, 4)) * 1e-9)
     np.testing.assert_allclose(np.linalg.norm(quats, axis=1), 1, rtol=1e-6)
     largest, others = smallest_three(quats)
     assert np.abs(others).max() <= np.sqrt(0.5) + 1e-6
@@ -48,7 +48,9 @@ def test_smallest_three_and_back() -> None:
     sign = np.sign(np.take_along_axis(quats, largest[:, None], axis=1))
     np.testing.assert_allclose(back, quats * sign, atol=1e-6)
     extremes = np.float32([[0, 0, 0, 0], [1e30, 0, 0, 0], [3e38, -3e38, 0, 0]])
-    np.testing.assert_allclose(unit_quaternions(extremes), [[1, 0, 0, 0], [1, 0, 0, 0], [0.5**0.5, -(0.5**0.5), 0, 0]])
+    np.testing.assert_allclose(
+        normalize_quaternions(extremes), [[1, 0, 0, 0], [1, 0, 0, 0], [0.5**0.5, -(0.5**0.5), 0, 0]]
+    )
 
 
 def test_morton_order_keeps_neighbours_together() -> None:

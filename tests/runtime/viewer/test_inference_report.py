@@ -13,7 +13,7 @@ from idesplat.runtime.cli.infer import main
 from idesplat.runtime.splats.gaussians import Gaussians, with_colours
 from idesplat.runtime.splats.points import points_from_depth
 from idesplat.runtime.viewer.report import write_report
-from idesplat.runtime.views.batch import Views
+from idesplat.runtime.views.batch import ViewBatch
 
 TRAP = "<img src=x onerror=document.title='caught'>"
 SIDE = 64
@@ -67,7 +67,7 @@ def test_says_what_the_summary_says(written):
         assert words in page
 
 
-def flat_scene(colour: float) -> tuple[np.ndarray, Gaussians, Views]:
+def flat_scene(colour: float) -> tuple[np.ndarray, Gaussians, ViewBatch]:
     """Two cameras before a grey wall, and splats that show it in this brightness."""
     extrinsics = np.stack([np.eye(4), np.eye(4)])
     extrinsics[1, 0, 3] = 0.1
@@ -79,7 +79,7 @@ def flat_scene(colour: float) -> tuple[np.ndarray, Gaussians, Views]:
     scales, quats = np.full((count, 3), 0.05), np.tile([1.0, 0, 0, 0], (count, 1))
     wide = means * [3, 3, 1]  # beyond the edges of both pictures
     gaussians = with_colours(wide, scales * 3, quats, np.ones(count), np.full((count, 3), colour))
-    return depth, gaussians, Views(["a", "b"], images, extrinsics, intrinsics, [])
+    return depth, gaussians, ViewBatch(["a", "b"], images, extrinsics, intrinsics, [])
 
 
 def test_psnr_and_confidence_of_what_is_known(tmp_path):

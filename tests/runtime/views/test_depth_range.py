@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from idesplat.runtime.cameras.io import read_cameras
 from idesplat.runtime.errors import InputError
-from idesplat.runtime.geometry.depth_bounds import range_of_depths
-from idesplat.runtime.views.batch import prepare
-from idesplat.runtime.views.depth_range import find_depth_range, scene_distances
+from idesplat.runtime.geometry.depth_bounds import depth_bounds
+from idesplat.runtime.views.batch import build_view_batch
+from idesplat.runtime.views.depth_range import estimate_depth_range, scene_depths
 from idesplat.runtime.views.loader import ViewLoader
 
 TRAINED = (1.0, 100.0)
@@ -23,9 +23,15 @@ def room(scene):
 
 
 def ranged(pairs, **given):
-    views = prepare(pairs, None, 96, 128)
-    return find_depth_range(
-        views.images, views.extrinsics, views.intrinsics, views.cameras, TRAINED, samples=views.samples, **given
+    views = build_view_batch(pairs, None, 96, 128)
+    return estimate_depth_range(
+        views.images,
+        views.extrinsics,
+        views.intrinsics,
+        views.cameras,
+        TRAINED,
+        feature_images=views.feature_images,
+        **given,
     )
 
 
@@ -71,7 +77,7 @@ def test_without_matches_the_baseline_decides(room):
 
 def test_the_scene_is_as_far_as_it_is(room):
     pairs, depth = room
-    distances, source = scene_distances([camera for _, camera in pairs], ViewLoader(pairs, 64, 96).sample)
+    distances, source = scene_depths([camera for _, camera in pairs], ViewLoader(pairs, 64, 96).sample)
     assert "points matched" in source
     assert 0.6 < distances[0] / np.median(depth) < 1.6
 
@@ -79,7 +85,7 @@ def test_the_scene_is_as_far_as_it_is(room):
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0, 0.0])
 def test_range_of_depths_leaves_out_what_is_no_depth(bad):
     depths = np.linspace(2, 10, 101)
-    near, far = range_of_depths(np.append(depths, [bad] * 50))
-    assert (near, far) == range_of_depths(depths)
+    near, far = depth_bounds(np.append(depths, [bad] * 50))
+    assert (near, far) == depth_bounds(depths)
     assert 0 < near < 2 and far > 10
-    assert range_of_depths(np.full(50, bad)) is None
+    assert depth_bounds(np.full(50, bad)) is None

@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.views import selection as view_choice
-from idesplat.runtime.views.batch import check_views, match, prepare
-from idesplat.runtime.views.selection import Scorer, choose_views, compare, guess_distances
+from idesplat.runtime.views.batch import build_view_batch, check_view_arrays, match_images_to_cameras
+from idesplat.runtime.views.selection import PairScorer, guess_scene_depths, score_pairs, select_views
 
 
 def names(pairs):
@@ -28,13 +28,17 @@ def test_match_goes_by_name_never_by_order():
     cameras = [camera("images/b.jpg"), camera("./images/unused.jpg"), camera("images\\a.jpg"), camera("train/r_0.5")]
     images = [Path("x/images/a.jpg"), Path("x/images/b.jpg"), Path("x/train/r_0.5.png")]
     expected = [("x/images/a.jpg", "images\\a.jpg"), ("x/images/b.jpg", "images/b.jpg")]
-    assert names(match(images, cameras)) == [*expected, ("x/train/r_0.5.png", "train/r_0.5")]
+    assert names(match_images_to_cameras(images, cameras)) == [*expected, ("x/train/r_0.5.png", "train/r_0.5")]
 
 
 def test_match_prefers_the_suffix_then_the_folders():
     cameras = [camera("left/1.png"), camera("left/1.jpg"), camera("right/1.jpg"), camera("2.png")]
     images = [Path("/data/right/1.jpg"), Path("/data/left/1.jpg"), Path("/data/images_4/2.jpg")]
-    assert [name for _, name in names(match(images, cameras))] == ["right/1.jpg", "left/1.jpg", "2.png"]
+    assert [name for _, name in names(match_images_to_cameras(images, cameras))] == [
+        "right/1.jpg",
+        "left/1.jpg",
+        "2.png",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -49,7 +53,7 @@ def test_match_prefers_the_suffix_then_the_folders():
 )
 def test_match_mistakes(images, cameras, expected):
     with pytest.raises(InputError, match=expected):
-        match([Path(image) for image in images], [camera(name) for name in cameras])
+        match_images_to_cameras([Path(image) for image in images], [camera(name) for name in cameras])
 
 
 # ---- choosing
@@ -57,12 +61,12 @@ def test_match_mistakes(images, cameras, expected):
 
 def test_choose_takes_five_degrees_on_an_orbit():
     poses = orbit([0, 1, 40, 45.2, 90, 180, 181])
-    assert choose_views(at(poses), 2) == [2, 3]
+    assert select_views(at(poses), 2) == [2, 3]
 
 
 def test_choose_spreads_over_a_dense_video():
     poses = orbit(np.arange(0, 90, 1.0))
-    chosen = choose_views(at(poses), 4)
+    chosen = select_views(at(poses), 4)
     assert set(np.diff(chosen).tolist()) <= {5, 6}
 
 
@@ -70,7 +74,7 @@ def test_choose_prefers_a_step_aside_to_a_step_forward():
     poses = np.stack([np.eye(4)] * 4)
     poses[:, :3, 3] = [(0, 0, 0), (0, 0, 0.4), (0.3, 0, 0), (0, 0, 0.8)]
     cameras = [replace(camera, depth_range=(1.0, 16.0)) for camera in at(poses)]
-    assert choose_views(cameras, 2) == [0, 2]
+    assert select_views(cameras, 2) == [0, 2]
 
 
 def test_what_cameras_are_known_to_see_decides_the_baseline():
@@ -78,7 +82,7 @@ def test_what_cameras_are_known_to_see_decides_the_baseline():
     poses[:, 0, 3] = (0, 0.1, 1, 10)
     for distance in (1, 10, 100):
         cameras = [replace(camera, depth_range=(0.5 * distance, 2.0 * distance)) for camera in at(poses)]
-        first, second = choose_views(cameras, 2)
+        first, second = select_views(cameras, 2)
         assert 0.08 < (poses[second, 0, 3] - poses[first, 0, 3]) / distance < 0.11
 
 
@@ -86,7 +90,7 @@ def test_compare_knows_overlap_and_parallax():
     poses = np.stack([np.eye(4)] * 3)
     poses[1, 0, 3] = 40 / 70  # half of the picture at a distance of 1, where 70 pixels are one unit
     poses[2, :3, :3] = np.diag([-1, 1, -1])  # looks back
-    pairs = compare(at(poses), np.ones(3))
+    pairs = score_pairs(at(poses), np.ones(3))
     assert pairs.overlap[0, 1] == pairs.overlap[1, 0] == pytest.approx(0.5)
     assert 20 < pairs.parallax[0, 1] < np.degrees(2 * np.arctan(20 / 70))
     assert pairs.overlap[0, 2] == pairs.parallax[0, 2] == 0 and np.isinf(pairs.cost[0, 2])
@@ -99,32 +103,32 @@ def test_choose_does_not_depend_on_frame_or_unit():
     moved = turned @ poses
     moved[:, :3, 3] = 50 * moved[:, :3, 3] + (3, -8, 1)
     for count in range(2, 6):
-        assert choose_views(at(moved), count) == choose_views(at(poses), count)
+        assert select_views(at(moved), count) == select_views(at(poses), count)
 
 
 def test_choose_avoids_cameras_that_look_elsewhere():
     # Parallel cameras on a line; the second has the better baseline but is turned away from what the others see.
     poses = np.stack([np.eye(4)] * 4)
     poses[:, 0, 3] = (0, 0.26, 0.3, 1)
-    assert choose_views(at(poses), 2) == [0, 1]
+    assert select_views(at(poses), 2) == [0, 1]
     poses[1, :3, :3] = cv2.Rodrigues(np.array([0, 2.5, 0]))[0]
-    assert choose_views(at(poses), 2) == [0, 2]
+    assert select_views(at(poses), 2) == [0, 2]
 
 
 def test_choose_does_not_repeat_a_place():
     poses = orbit([0, 5, 5, 0, 10])
-    assert choose_views(at(poses), 3) == [0, 1, 4]
-    assert choose_views(at(poses), 5) == [0, 1, 2, 3, 4]
-    assert len(set(choose_views(at(poses), 4))) == 4
+    assert select_views(at(poses), 3) == [0, 1, 4]
+    assert select_views(at(poses), 5) == [0, 1, 2, 3, 4]
+    assert len(set(select_views(at(poses), 4))) == 4
 
 
 def test_choose_mistakes():
     with pytest.raises(InputError, match="3 views asked for, expected 2 to 2"):
-        choose_views(at(orbit([0, 5])), 3)
+        select_views(at(orbit([0, 5])), 3)
     with pytest.raises(InputError, match="1 views asked for"):
-        choose_views(at(orbit([0, 5])), 1)
+        select_views(at(orbit([0, 5])), 1)
     with pytest.raises(InputError, match="no two cameras see the same from different places"):
-        choose_views(at([np.eye(4)] * 3), 2)
+        select_views(at([np.eye(4)] * 3), 2)
 
 
 @given(
@@ -137,7 +141,7 @@ def test_choose_gives_distinct_rising_indices_or_an_input_error(values, count):
     for pose, value in zip(poses, values, strict=True):
         pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(np.array(value[:3]))[0], value[3:]
     try:
-        chosen = choose_views(at(poses), count)
+        chosen = select_views(at(poses), count)
     except InputError:
         return
     assert len(chosen) == count and chosen == sorted(set(chosen)) and chosen[0] >= 0 and chosen[-1] < len(values)
@@ -169,7 +173,7 @@ def every_pair_scored(cameras, distances):
 @pytest.mark.parametrize("name", captures(9))
 def test_choosing_goes_by_the_best_of_all_pairs(name):
     cameras = at(captures(36)[name])
-    distances = guess_distances(cameras)
+    distances = guess_scene_depths(cameras)
     cost = every_pair_scored(cameras, distances)
     centres = np.stack([camera.extrinsics[:3, 3] for camera in cameras])
     chosen = list(np.unravel_index(cost.argmin(), cost.shape))
@@ -177,21 +181,21 @@ def test_choosing_goes_by_the_best_of_all_pairs(name):
         rest = [index for index in range(len(cameras)) if index not in chosen]
         nearest = [chosen[int(np.linalg.norm(centres[chosen] - centres[index], axis=1).argmin())] for index in rest]
         chosen.append(rest[int(cost[rest, nearest].argmin())])
-    assert choose_views(cameras, 4) == sorted(chosen)
-    assert choose_views(cameras, 2) == sorted(chosen[:2])
+    assert select_views(cameras, 4) == sorted(chosen)
+    assert select_views(cameras, 2) == sorted(chosen[:2])
 
 
 @pytest.mark.parametrize("name", captures(9))
 def test_large_captures_give_nearly_the_best_pair(name, monkeypatch):
     """Where not every pair is scored, the best that is found is nearly as good as the best there is."""
     cameras = at(captures(200, seed=1)[name])
-    scorer = Scorer(cameras, guess_distances(cameras))
+    scorer = PairScorer(cameras, guess_scene_depths(cameras))
     best = scorer.score(*np.triu_indices(len(cameras), 1)).cost.min()
     monkeypatch.setattr(view_choice, "EXHAUSTIVE", 40)
-    first, second = choose_views(cameras, 2)
+    first, second = select_views(cameras, 2)
     found = scorer.score(np.array([first]), np.array([second])).cost[0]
     assert found <= best + 0.15  # a fifth of a parallax twice too large would be 0.26
-    assert len(set(choose_views(cameras, 6))) == 6
+    assert len(set(select_views(cameras, 6))) == 6
 
 
 def test_ten_thousand_cameras_take_little_memory():
@@ -231,7 +235,7 @@ def pairs(tmp_path):
 
 
 def test_prepare_gives_what_the_network_takes(pairs):
-    views = prepare(pairs, None, 32, 32)
+    views = build_view_batch(pairs, None, 32, 32)
     assert views.names == ["0.png", "1.png", "2.png"]
     assert views.images.shape == (3, 3, 32, 32)
     for index, image in enumerate(views.images):
@@ -244,25 +248,28 @@ def test_prepare_gives_what_the_network_takes(pairs):
     expected = [[70 * scale_x / 32, 0, (42 * scale_x - 5) / 32], [0, 72 * scale_y / 32, 29 * scale_y / 32], [0, 0, 1]]
     np.testing.assert_allclose(views.intrinsics, [expected] * 3, rtol=1e-6)
     assert [array.dtype for array in (views.images, views.intrinsics, views.extrinsics)] == ["f4", "f4", "f8"]
-    assert views.choice == ""
+    assert views.selection_reason == ""
     assert [camera.distortion for camera in views.cameras] == [None] * 3
-    check_views(views.images, views.extrinsics, views.intrinsics, 0.5, 100)
+    check_view_arrays(views.images, views.extrinsics, views.intrinsics, 0.5, 100)
 
 
 def test_prepare_reads_only_the_chosen_where_depths_are_known(pairs):
     pairs[2][0].unlink()
     pairs = [(path, replace(camera, depth_range=(2.0, 8.0))) for path, camera in pairs]
-    views = prepare(pairs, 2, 32, 32)
+    views = build_view_batch(pairs, 2, 32, 32)
     assert views.names == ["0.png", "1.png"]
-    assert "degrees apart" in views.choice and "4 away by what the cameras are known to see" in views.choice
+    assert (
+        "degrees apart" in views.selection_reason
+        and "4 away by what the cameras are known to see" in views.selection_reason
+    )
 
 
 def test_prepare_scales_cameras_of_larger_pictures(pairs):
     doubled = [
         (path, replace(camera, width=160, height=120, K=np.diag([2, 2, 1]) @ camera.K)) for path, camera in pairs
     ]
-    expected = prepare(pairs, None, 32, 32)
-    views = prepare(doubled, None, 32, 32)
+    expected = build_view_batch(pairs, None, 32, 32)
+    views = build_view_batch(doubled, None, 32, 32)
     np.testing.assert_allclose(views.intrinsics, expected.intrinsics)
     assert (views.cameras[1].width, views.cameras[1].height) == (80, 60)
 
@@ -270,17 +277,17 @@ def test_prepare_scales_cameras_of_larger_pictures(pairs):
 def test_prepare_mistakes(pairs):
     (path0, camera0), (path1, camera1), _ = pairs
     with pytest.raises(InputError, match="1 image with a camera, expected at least 2"):
-        prepare(pairs[:1], None, 32, 32)
+        build_view_batch(pairs[:1], None, 32, 32)
     turned = replace(camera1, width=60, height=80, K=np.array([[70.0, 0, 30], [0, 70, 40], [0, 0, 1]]))
     with pytest.raises(InputError, match=r"1\.png: the image has 80 x 60 pixels, its camera 60 x 80"):
-        prepare([(path0, camera0), (path1, turned)], None, 32, 32)
+        build_view_batch([(path0, camera0), (path1, turned)], None, 32, 32)
     twin = camera0.extrinsics + 1e-6 * np.eye(4, k=3)
     with pytest.raises(InputError, match=r"0\.png and 1\.png have the same pose"):
-        prepare([(path0, camera0), (path1, replace(camera1, extrinsics=twin)), pairs[2]], None, 32, 32)
+        build_view_batch([(path0, camera0), (path1, replace(camera1, extrinsics=twin)), pairs[2]], None, 32, 32)
     same_place = camera1.extrinsics.copy()
     same_place[:3, 3] = camera0.extrinsics[:3, 3]
     with pytest.raises(InputError, match=r"0\.png and 1\.png stand at the same place"):
-        prepare([(path0, camera0), (path1, replace(camera1, extrinsics=same_place))], None, 32, 32)
+        build_view_batch([(path0, camera0), (path1, replace(camera1, extrinsics=same_place))], None, 32, 32)
 
 
 # ---- checking arrays
@@ -295,9 +302,9 @@ def arrays():
 
 
 def test_good_arrays_pass(arrays):
-    check_views(**arrays)
-    check_views(**{**arrays, "near": np.array([0.5, 0.7]), "far": np.array([100, 50])})
-    check_views(**{**arrays, "images": arrays["images"].tolist()})
+    check_view_arrays(**arrays)
+    check_view_arrays(**{**arrays, "near": np.array([0.5, 0.7]), "far": np.array([100, 50])})
+    check_view_arrays(**{**arrays, "images": arrays["images"].tolist()})
 
 
 def put(array, index, value):
@@ -337,25 +344,25 @@ def put(array, index, value):
 )
 def test_bad_arrays_are_named(arrays, name, change, expected):
     with pytest.raises(InputError, match=expected) as caught:
-        check_views(**{**arrays, name: change(arrays[name])})
+        check_view_arrays(**{**arrays, name: change(arrays[name])})
     assert "\n" not in str(caught.value)
 
 
 def test_one_view_is_too_few(arrays):
     first = {name: value[:1] for name, value in arrays.items() if name not in ("near", "far")}
     with pytest.raises(InputError, match="1 view given, expected at least 2"):
-        check_views(**first, near=0.5, far=100)
+        check_view_arrays(**first, near=0.5, far=100)
 
 
 def test_two_of_three_cameras_coincide(arrays):
     poses = orbit([0, 5, 0])
     three = {name: np.concatenate([arrays[name], arrays[name][:1]]) for name in ("images", "intrinsics")}
     with pytest.raises(InputError, match="view 0 and view 2 have the same pose"):
-        check_views(**three, extrinsics=poses, near=0.5, far=100)
+        check_view_arrays(**three, extrinsics=poses, near=0.5, far=100)
 
 
 def test_two_of_three_cameras_may_share_a_place(arrays):
     poses = orbit([0, 5, 0])
     poses[2, :3, :3] = poses[1, :3, :3]
     three = {name: np.concatenate([arrays[name], arrays[name][:1]]) for name in ("images", "intrinsics")}
-    check_views(**three, extrinsics=poses, near=0.5, far=100)
+    check_view_arrays(**three, extrinsics=poses, near=0.5, far=100)

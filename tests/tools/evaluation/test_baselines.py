@@ -7,7 +7,7 @@ import pytest
 from idesplat.runtime.cameras.io import read_cameras
 from idesplat.runtime.images.io import find_images
 from idesplat.runtime.splats.points import unproject
-from idesplat.runtime.views.batch import match
+from idesplat.runtime.views.batch import match_images_to_cameras
 from idesplat.runtime.views.depth_range import DepthRange
 from idesplat.tools.evaluation.baselines import (
     SPLAT_PIXELS,
@@ -100,7 +100,7 @@ def test_the_nearest_view_fills_what_none_sees() -> None:
 
 def test_no_plane_of_a_dense_sweep_is_better(scene) -> None:
     """On a furnished room, where no plane fits."""
-    frames = match(find_images([scene / "images"]), read_cameras(scene / "transforms.json"))
+    frames = match_images_to_cameras(find_images([scene / "images"]), read_cameras(scene / "transforms.json"))
     case = load_case(frames, [1, 3], [2], (64, 96), lambda views: DepthRange(0.5, 100.0, "guessed"))
     context, truth, valid = case.context, case.targets.image(0), case.targets.valid[0]
     pose, K = case.targets.extrinsics[0], case.targets.K(0)

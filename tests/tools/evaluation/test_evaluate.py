@@ -14,10 +14,10 @@ from conftest import run_command
 from idesplat import Gaussians, Predictor, rasterize, read_cameras
 from idesplat.runtime.cli.outputs import Outputs
 from idesplat.runtime.images.io import find_images, load_image
-from idesplat.runtime.images.resizing import fit
+from idesplat.runtime.images.resizing import resize_and_crop
 from idesplat.runtime.inference import predictor as predictor_module
-from idesplat.runtime.system.files import replacing
-from idesplat.runtime.views.batch import match
+from idesplat.runtime.system.files import atomic_write
+from idesplat.runtime.views.batch import match_images_to_cameras
 from idesplat.tools.evaluation import cli as evaluate
 from idesplat.tools.evaluation.cases import procedural_case
 from idesplat.tools.evaluation.chunks import IndexEntry, chunk_cases
@@ -72,7 +72,7 @@ def test_scene_measures_what_the_library_gives(workplace: Path, opened: Predicto
     cameras = read_cameras("transforms.json")
     context = [cameras[0], cameras[4]]
     prediction = opened.predict([Path(camera.name) for camera in context], context, near=1, far=20)
-    pixels, intrinsics = fit(load_image(Path(cameras[2].name)), cameras[2].K, 64, 96)
+    pixels, intrinsics = resize_and_crop(load_image(Path(cameras[2].name)), cameras[2].K, 64, 96)
     image = pixels.transpose(1, 2, 0)
     K = np.diag([96, 64, 1]) @ intrinsics
     drawn = drawn_from(prediction.gaussians, cameras[2].extrinsics, K, near=0.01)
@@ -92,7 +92,7 @@ def test_scene_measures_what_the_library_gives(workplace: Path, opened: Predicto
     mean = np.mean([target["scores"]["model"]["psnr"] for target in only["targets"]])
     assert content["mean"]["model"]["psnr"] == pytest.approx(mean)
 
-    frames = match(find_images(["images"]), read_cameras("transforms.json"))
+    frames = match_images_to_cameras(find_images(["images"]), read_cameras("transforms.json"))
     truth = load_case(frames, [0, 4], [1], (64, 96), opened.depth_range, Path("depth")).depth
     error = np.abs(prediction.depth - truth) / truth
     ratio = np.maximum(prediction.depth / truth, truth / prediction.depth)
@@ -250,7 +250,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(name: str, workplace: Path, ca
     spoil, arguments, expected = BAD[name]
     spoil()
     Path("out").mkdir()
-    with Outputs("idesplat-eval"), replacing(Path("out/results.json")) as temporary:
+    with Outputs("idesplat-eval"), atomic_write(Path("out/results.json")) as temporary:
         temporary.write_bytes(b"the result of yesterday")
     before = {path: path.stat().st_mtime_ns for path in workplace.rglob("*")}
     assert run_command(main, *arguments) == 2

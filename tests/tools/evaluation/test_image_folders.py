@@ -12,7 +12,7 @@ from idesplat.runtime.cameras.camera import Camera
 from idesplat.runtime.cameras.io import read_cameras
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.images.io import find_images
-from idesplat.runtime.views.batch import Views, match, prepare
+from idesplat.runtime.views.batch import ViewBatch, build_view_batch, match_images_to_cameras
 from idesplat.runtime.views.depth_range import DepthRange
 from idesplat.tools.evaluation.image_folders import Frame, chosen_frames, context_for, load_case
 from idesplat.tools.synthetic.sampler import look_at
@@ -20,13 +20,13 @@ from idesplat.tools.synthetic.sampler import look_at
 SIZE = HEIGHT, WIDTH = 64, 96  # of images 96 x 128: scaled to 72 x 96, four rows cut above and below
 
 
-def find_range(views: Views) -> DepthRange:
+def find_range(views: ViewBatch) -> DepthRange:
     """From the number of views, to know what it was asked for."""
     return DepthRange(1, 10 * len(views.names), "the test")
 
 
 def frames_of(folder: Path) -> list[Frame]:
-    return match(find_images([folder / "images"]), read_cameras(folder / "transforms.json"))
+    return match_images_to_cameras(find_images([folder / "images"]), read_cameras(folder / "transforms.json"))
 
 
 def on_a_line(count: int) -> list[Frame]:
@@ -93,7 +93,7 @@ def test_pictures_as_the_runtime_prepares_them(scene: Path) -> None:
         ["002.png", "001.png"],
     )
     assert (case.near, case.far) == (1, 20)
-    views = prepare([frames[index] for index in (0, 4, 2, 1)], None, HEIGHT, WIDTH)
+    views = build_view_batch([frames[index] for index in (0, 4, 2, 1)], None, HEIGHT, WIDTH)
     np.testing.assert_array_equal(np.concatenate([case.context.images, case.targets.images]), views.images)
     np.testing.assert_array_equal(case.targets.extrinsics, views.extrinsics[2:])
     assert case.context.valid.all() and case.targets.valid.all()

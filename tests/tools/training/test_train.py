@@ -20,7 +20,7 @@ from idesplat.model.config import PRESETS, DPBUConfig, DPTConfig, FocusConfig, I
 from idesplat.model.idesplat.network import IDESplat
 from idesplat.runtime.cameras.camera import Camera
 from idesplat.runtime.errors import EXIT_STATUS, InputError
-from idesplat.runtime.views.batch import Views, prepare
+from idesplat.runtime.views.batch import ViewBatch, build_view_batch
 from idesplat.tools.synthetic.make_scene import make_scene
 from idesplat.tools.training import captures as training_folders
 from idesplat.tools.training import cli as train
@@ -387,10 +387,10 @@ def test_validation_renders_photographs_that_training_never_uses(
         used[now].add(pair[0].name)
         return opened(pair, height, width)
 
-    def noted_all(pairs: list[tuple[Path, Camera]], *rest: object) -> Views:
+    def noted_all(pairs: list[tuple[Path, Camera]], *rest: object) -> ViewBatch:
         if now == "train":
             used[now].update(path.name for path, _ in pairs)
-        return prepare(pairs, *rest)
+        return build_view_batch(pairs, *rest)
 
     monkeypatch.setattr(training_folders, "take", noted)
     monkeypatch.setattr(training_folders, "prepare", noted_all)

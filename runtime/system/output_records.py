@@ -65,7 +65,7 @@ def add_to_record(path: Path, command: str) -> None:
             file.write(line)  # in one call, so that lines of several processes do not mix
 
 
-def matches(path: Path, entry: WrittenFile | None) -> bool:
+def is_unchanged(path: Path, entry: WrittenFile | None) -> bool:
     """Whether a file is still what the record says of it."""
     if entry is None:
         return False

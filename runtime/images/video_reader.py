@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..system.files import check_regular
-from ..system.limits import whole_number
+from ..system.limits import parse_whole_number
 from ..system.progress import working
 from .header import check_megapixels
 
@@ -28,7 +28,7 @@ def is_video(path: Path) -> bool:
     return path.suffix.lower() in SUFFIXES
 
 
-def sample_frames(video: Path, folder: Path) -> list[Path]:
+def extract_sharp_frames(video: Path, folder: Path) -> list[Path]:
     """Write the sharpest frame of each of FRAMES equal parts of a video to a folder; the files in order.
 
     Raises InputError if the video cannot be read or has fewer than two frames.
@@ -42,10 +42,10 @@ def sample_frames(video: Path, folder: Path) -> list[Path]:
     return _write_frames(video, {number: f"{video.stem}-{number:06}.png" for number in best}, folder)
 
 
-def named_frames(video: Path, names: Sequence[str], folder: Path) -> list[Path]:
+def extract_named_frames(video: Path, names: Sequence[str], folder: Path) -> list[Path]:
     """Write the frames that cameras name to a folder, FRAMES of them at most; the files are called as in `names`.
 
-    A name is `<video>-<number>`, as `sample_frames` gives it, or a time in microseconds, as RealEstate10K has it.
+    A name is `<video>-<number>`, as `extract_sharp_frames` names files, or a time in microseconds, as in RealEstate10K.
     Raises InputError if the video cannot be read or no name is of these kinds.
     """
     rate = _frame_rate(video)
@@ -129,8 +129,8 @@ def _number(name: str, video: Path, rate: float) -> int | None:
     stem = _stem(name)
     numbered = NUMBERED.fullmatch(stem)
     if numbered and numbered[1] == video.stem:
-        return whole_number(numbered[2])
-    microseconds = whole_number(stem)
+        return parse_whole_number(numbered[2])
+    microseconds = parse_whole_number(stem)
     return round(microseconds * rate / 1e6) if microseconds is not None and rate else None
 
 
