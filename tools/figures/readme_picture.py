@@ -1,6 +1,6 @@
 """The README's image: what the bundled model makes of two images of the drawn room.
 
-python -P -m idesplat.tools.figures.readme_picture demo/scene docs/picture.png
+python -P -m idesplat.tools.figures.readme_picture demo/scene docs/images/picture.png
 """
 
 from pathlib import Path
