@@ -160,7 +160,7 @@ def infer(
     _check_fit(predictor, out, cleaning, {"--render": render, "--report": report})
     _check_depth_format(depth_format, save_depth, predictor)
     preparing = time.perf_counter()
-    inputs = read_inputs(given, predictor)
+    inputs = read_inputs(given, predictor.model)
     prepared = inputs.views
     if not predictor.metadata.gaussians and save_depth is None:  # depth maps are what such a model is for
         save_depth = _beside(out, DEPTH_FOLDER)
@@ -347,7 +347,9 @@ def _check_fit(predictor: "Predictor", out: Path, cleaning: "FilterOptions", dra
         needs += [f"--{step.replace('_', '-')}" for step in cleaning.enabled]
     if needs and not predictor.metadata.gaussians:
         endings = ", ".join((*POINT_SUFFIXES, *MESHES))
-        raise InputError(f"{needs[0]}: {predictor.path} predicts depth alone; write points or a surface ({endings})")
+        raise InputError(
+            f"{needs[0]}: {predictor.model.path} predicts depth alone; write points or a surface ({endings})"
+        )
     if is_surface(out) and set(cleaning.enabled) - {"max_depth_jump"}:
         raise InputError(f"--out {out}: of all cleaning a surface knows --max-depth-jump alone; leave out the rest")
 
@@ -481,7 +483,7 @@ def _summary(
 
     own, depth = predictor.metadata, prediction.depth
     return {
-        "model": {"path": str(predictor.path), **asdict(own)},
+        "model": {"path": str(predictor.model.path), **asdict(own)},
         "cameras": cameras,
         "views": inputs.views.names,
         "notes": inputs.notes,

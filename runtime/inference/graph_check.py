@@ -1,25 +1,16 @@
 """Whether a graph is what its metadata and manifest say: before it runs by its signature, afterwards by its results."""
 
-import re
-from collections.abc import Iterator, Mapping, Sequence
-from mmap import ACCESS_READ, mmap
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
 from ..errors import InputError
-from ..system.files import open_regular
-from .metadata import INPUTS, OUTPUTS, ModelMetadata
+from .metadata import INPUTS, ModelMetadata, promised
 from .metadata_fields import shown
 
 FLOAT = "tensor(float)"
-# A tensor in ONNX's format whose values lie in another file says so by the property "location" and the file's name.
-LOCATION = re.compile(rb"\n\x08location\x12([\x01-\x7f])", re.DOTALL)
-# The same with a name of 128 bytes and more, whose length takes two bytes.
-LONG_LOCATION = re.compile(rb"\n\x08location\x12[\x80-\xff][\x01-\x7f]", re.DOTALL)
-# Protobuf reads no message of 2 GiB or more.
-LARGEST_FILE = (1 << 31) - 1
 
 
 class Value(Protocol):
@@ -38,44 +29,6 @@ class Graph(Protocol):
 
     def get_outputs(self) -> Sequence[Value]:
         """What it yields."""
-
-
-def check_file(path: Path) -> None:
-    """Raise InputError for a graph that no ONNX file can be, or whose weights lie outside its folder or are not there.
-
-    ONNX Runtime refuses most of this, too, but not in every version, and waits for ever for a named pipe.
-    """
-    if not path.is_file():
-        raise InputError(f"{path}: is no regular file, expected a .onnx file made by idesplat-export")
-    size = path.stat().st_size
-    if size > LARGEST_FILE:
-        raise InputError(f"{path}: has {size >> 30} GiB, expected a graph of less than 2 GiB; is it an .onnx file?")
-    if size:
-        for location in _external_files(path):
-            _check_location(path, location)
-
-
-def _external_files(path: Path) -> Iterator[str]:
-    """The names of the files that hold some of a graph's weights."""
-    with open_regular(path) as file, mmap(file.fileno(), 0, access=ACCESS_READ) as content:
-        if LONG_LOCATION.search(content):
-            raise InputError(f"{path}: keeps weights in a file whose name has more than 127 bytes; export it again")
-        for found in {content[at.end() : at.end() + at.group(1)[0]] for at in LOCATION.finditer(content)}:
-            yield found.decode(errors="replace")
-
-
-def _check_location(path: Path, location: str) -> None:
-    folder = path.parent.resolve()
-    try:
-        beside = (folder / location).resolve()
-        inside = not Path(location).is_absolute() and beside.is_relative_to(folder)
-        there = beside.is_file()
-    except ValueError:  # a name that no file can have
-        inside = there = False
-    if not inside:
-        raise InputError(f"{path}: keeps weights in {shown(location)}, outside its folder; expected a file beside it")
-    if not there:
-        raise InputError(f"{path}: keeps weights in {shown(location)}, which is no file; move it along with the graph")
 
 
 def check_fused(path: Path, graph: Graph, own: ModelMetadata) -> None:
@@ -107,11 +60,6 @@ def check_stage(
             raise _mismatch(path, f"{shown(name)} is a {value.type}, an earlier stage yields a {known[name]}")
     known |= {name: value.type for name, value in outputs.items()}
     _check_values(path, inputs, outputs, own)
-
-
-def promised(own: ModelMetadata) -> Sequence[str]:
-    """What a model yields in the end."""
-    return OUTPUTS if own.gaussians else OUTPUTS[:1]
 
 
 def check_results(values: Mapping[str, object], views: int, height: int, width: int, own: ModelMetadata) -> None:

@@ -97,6 +97,11 @@ _ADDED_LATER = frozenset({"gaussians", "precision", "conventions"})
 _STAGE: dict[str, Check] = {"name": string, "file": string, "inputs": names, "outputs": names}
 
 
+def promised(metadata: ModelMetadata) -> Sequence[str]:
+    """The outputs of a model."""
+    return OUTPUTS if metadata.gaussians else OUTPUTS[:1]
+
+
 def read_metadata(properties: dict[str, str], path: Path) -> ModelMetadata:
     """The description in a model's metadata properties; raises InputError if it is none of ours, or damaged."""
     if METADATA_KEY not in properties:

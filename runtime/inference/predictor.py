@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..cameras.camera import Camera
+<<<<<<< HEAD
 from ..errors import InputError, error_context
 from ..images.arrays import as_uint8_image
 from ..images.sizes import describe_size_rule, is_valid_size
@@ -16,10 +17,18 @@ from ..views.batch import ViewBatch, build_view_batch, check_view_arrays
 from ..views.depth_range import DepthRange, estimate_depth_range
 from .graph_check import check_file, check_fused, check_results, check_stage, promised
 from .metadata import INPUTS, ModelMetadata, StageFile, read_manifest, read_metadata
+=======
+from ..errors import InputError, located
+from ..images.arrays import eight_bit_image
+from ..splats.gaussians import Gaussians
+from ..views.batch import Views, check_views, prepare
+from ..views.depth_range import DepthRange, find_depth_range
+from .graph_check import check_fused, check_results, check_stage
+from .metadata import ModelMetadata, StageFile, promised
+from .model_files import ModelFiles, read_model
+>>>>>>> 80db4d5 (Read a model's metadata without opening a session)
 from .normalization import SceneNormalization
 from .session import CPU, DEFAULT, SessionConfig, open_session, provider_name, run_limit_s, run_session
-
-FUSED = "model"
 
 
 @dataclass(frozen=True)
@@ -47,33 +56,30 @@ class Prediction:
 class Predictor:
     """An exported model, ready to run.
 
-    model: a `.onnx` of this project, or a folder that `idesplat-export --staged` wrote.
+    model: a `.onnx` of this project, a folder that `idesplat-export --staged` wrote, or what `read_model` returns.
     provider: an ONNX Runtime execution provider, such as CPU or CUDA.
     config: threads and profiling, for those who measure.
     Raises InputError if the model is not ours or damaged, or the provider is not there.
     """
 
-    def __init__(self, model: Path | str, provider: str = CPU, config: SessionConfig = DEFAULT) -> None:
-        self.path = Path(model)
-        if not self.path.exists():
-            raise InputError(f"{self.path}: no such model; give a .onnx file or staged folder made by idesplat-export")
+    def __init__(self, model: Path | str | ModelFiles, provider: str = CPU, config: SessionConfig = DEFAULT) -> None:
+        self.model = model if isinstance(model, ModelFiles) else read_model(model)
+        self._sessions = []
         provider = provider_name(provider)
-        stages = read_manifest(self.path) if self.path.is_dir() else [StageFile(FUSED, self.path.name, [], [])]
-        folder = self.path if self.path.is_dir() else self.path.parent
-        for stage in stages:
-            check_file(folder / stage.file)
         started = time.perf_counter()
-        self._stages = [
-            (stage, open_session(folder / stage.file, provider, _profiled(config, stage))) for stage in stages
-        ]
+        for stage in self.model.stages:
+            self._sessions.append(open_session(self.model.file_of(stage), provider, _profiled(config, stage)))
         self.load_seconds = time.perf_counter() - started
         try:
-            properties = self._stages[0][1].get_modelmeta().custom_metadata_map
-            self.metadata: ModelMetadata = read_metadata(properties, self.path)
-            self._check_graphs(folder)
+            self._check_graphs()
         except UnicodeDecodeError:
-            raise InputError(f"{self.path}: damaged: its metadata or names are not UTF-8; export it again") from None
-        self._keep = _last_uses([stage for stage, _ in self._stages])
+            raise InputError(f"{self.model.path}: damaged: names in its graph are not UTF-8; export it again") from None
+        self._keep = _last_uses(self.model.stages)
+
+    @property
+    def metadata(self) -> ModelMetadata:
+        """What the model was trained with and yields."""
+        return self.model.metadata
 
     def predict(
         self,
@@ -92,8 +98,8 @@ class Predictor:
         """
         if len(images) != len(cameras):
             raise InputError(f"{len(images)} images and {len(cameras)} cameras, expected one camera for each image")
-        height, width = size or self.size_for(cameras)
-        self.check_size(len(images), height, width)
+        height, width = size or self.model.size_for(cameras)
+        self.model.check_size(len(images), height, width)
         given = [
             (as_uint8_image(image, camera.name) if isinstance(image, np.ndarray) else image, camera)
             for image, camera in zip(images, cameras, strict=True)
@@ -138,8 +144,13 @@ class Predictor:
         result, in that unit.
         Raises InputError for anything the model cannot take.
         """
+<<<<<<< HEAD
         check_view_arrays(images, extrinsics, intrinsics, near, far)
         self.check_size(len(images), *np.shape(images)[2:])
+=======
+        check_views(images, extrinsics, intrinsics, near, far)
+        self.model.check_size(len(images), *np.shape(images)[2:])
+>>>>>>> 80db4d5 (Read a model's metadata without opening a session)
         arrays = np.asarray(images), np.asarray(extrinsics), np.asarray(intrinsics)
         if near is None or far is None:
             trained = self.metadata.near, self.metadata.far
@@ -161,7 +172,7 @@ class Predictor:
         """`predict_arrays`, with the names of the views."""
         check_view_arrays(images, extrinsics, intrinsics, near, far)
         views, _, height, width = images.shape
-        self.check_size(views, height, width)
+        self.model.check_size(views, height, width)
         nearest, farthest = (np.full(views, depth, np.float64) for depth in (near, far))
         frame = SceneNormalization.of(extrinsics, nearest, self.metadata.near)
         values = {
@@ -179,22 +190,22 @@ class Predictor:
         ]
         return replace(self._run(values, frame), cameras=cameras)
 
-    def _check_graphs(self, folder: Path) -> None:
+    def _check_graphs(self) -> None:
         """Raise InputError unless the graphs are what metadata and manifest say of them."""
-        if not self.path.is_dir():
-            (stage, session), outputs = self._stages[0], list(promised(self.metadata))
-            check_fused(self.path, session, self.metadata)
-            self._stages = [(replace(stage, inputs=list(INPUTS), outputs=outputs), session)]
+        model = self.model
+        if not model.path.is_dir():
+            check_fused(model.path, self._sessions[0], model.metadata)
             return
         types: dict[str, str] = {}
-        for stage, session in self._stages:
-            check_stage(folder / stage.file, session, stage.inputs, stage.outputs, self.metadata, types)
-        missing = [name for name in promised(self.metadata) if name not in types]
+        for stage, session in zip(model.stages, self._sessions, strict=True):
+            check_stage(model.file_of(stage), session, stage.inputs, stage.outputs, model.metadata, types)
+        missing = [name for name in promised(model.metadata) if name not in types]
         if missing:
-            raise InputError(f"{self.path}: no stage yields {missing[0]}; export it again")
+            raise InputError(f"{model.path}: no stage yields {missing[0]}; export it again")
 
     def end_profiling(self) -> list[Path]:
         """Stop noting operators, where `config.profile` asked for it; the files of notes, one for each stage."""
+<<<<<<< HEAD
         return [Path(session.end_profiling()) for _, session in self._stages]
 
     def size_for(self, cameras: Sequence[Camera]) -> tuple[int, int]:
@@ -237,18 +248,29 @@ class Predictor:
         if not is_valid_size(height, width, own.size_multiple):
             rule = describe_size_rule(own.size_multiple)
             raise InputError(f"{self.path}: cannot take images of {height}x{width}; {rule}")
+=======
+        return [Path(session.end_profiling()) for session in self._sessions]
+>>>>>>> 80db4d5 (Read a model's metadata without opening a session)
 
     def _run(self, values: dict[str, np.ndarray], frame: SceneNormalization) -> Prediction:
-        seconds = {}
+        path, seconds = self.model.path, {}
         views, _, height, width = values["images"].shape
         limit_s = run_limit_s(views * height * width)
-        for (stage, session), keep in zip(self._stages, self._keep, strict=True):
+        for stage, session, keep in zip(self.model.stages, self._sessions, self._keep, strict=True):
             started = time.perf_counter()
+<<<<<<< HEAD
             with error_context(str(self.path) if stage.name == FUSED else f"{self.path}: stage {stage.name}"):
                 values.update(run_session(session, values, stage.outputs, limit_s))
             seconds[stage.name] = time.perf_counter() - started
             values = {name: value for name, value in values.items() if name in keep}
         with error_context(str(self.path)):
+=======
+            with located(f"{path}: stage {stage.name}" if path.is_dir() else str(path)):
+                values.update(run_session(session, values, stage.outputs, limit_s))
+            seconds[stage.name] = time.perf_counter() - started
+            values = {name: value for name, value in values.items() if name in keep}
+        with located(str(path)):
+>>>>>>> 80db4d5 (Read a model's metadata without opening a session)
             check_results(values, views, height, width, self.metadata)
         gaussians = None
         if self.metadata.gaussians:

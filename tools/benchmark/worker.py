@@ -150,9 +150,9 @@ def gemm() -> Prepared:
 
 def describe(model: Path) -> Prepared:
     """What a model's file says of itself."""
-    from ...runtime.inference.predictor import Predictor
+    from ...runtime.inference.model_files import read_model
 
-    return asdict(Predictor(model).metadata), dict
+    return asdict(read_model(model).metadata), dict
 
 
 def exported(model: Path, provider: str, threads: int, workload: Workload) -> Prepared:

@@ -79,11 +79,11 @@ def scene(
     found = find_images([images])
     frames = match_images_to_cameras(found, read_cameras(cameras, found))
     predictor = _runner(model, out, [*found, *camera_files(cameras)])
-    count = predictor.view_count(views, None, DEFAULT_VIEWS) or DEFAULT_VIEWS
+    count = predictor.model.view_count(views, None, DEFAULT_VIEWS) or DEFAULT_VIEWS
     chosen = chosen_frames(frames, context or [], target or [], count, hold_out_every)
-    shape = parse_size(size) if size else predictor.size_for([camera for _, camera in frames])
+    shape = parse_size(size) if size else predictor.model.size_for([camera for _, camera in frames])
     for sources, held_out in chosen:
-        predictor.check_size(len(sources), *shape)
+        predictor.model.check_size(len(sources), *shape)
         say(f"held out {_names(frames, held_out)}, inferred from {_names(frames, sources)}")
     find_range = partial(predictor.depth_range, near=near, far=far)
     cases = (load_case(frames, *numbers, shape, find_range, depth) for numbers in chosen)
@@ -116,7 +116,7 @@ def chunks(
     predictor = _runner(model, out, [index, *files])
     own = predictor.metadata
     for views in sorted({len(entry.context) for entry in entries.values()}):
-        predictor.check_size(views, own.height, own.width)
+        predictor.model.check_size(views, own.height, own.width)
     shape = own.height, own.width
     near, far = near if near is not None else own.near, far if far is not None else own.far
     if not 0 < near < far:
@@ -173,7 +173,7 @@ def procedural(
 
     predictor = _runner(model, out, [])
     shape = parse_size(size) if size else (predictor.metadata.height, predictor.metadata.width)
-    predictor.check_size(views, *shape)
+    predictor.model.check_size(views, *shape)
     pool = views if pool_views is None else pool_views
     if pool < views:
         raise InputError(f"--pool-views {pool}: expected at least the {views} of --views")
@@ -210,7 +210,7 @@ def captures(
     predictor = _runner(model, out, [])
     shape = parse_size(size) if size else (predictor.metadata.height, predictor.metadata.width)
     for count in counts:
-        predictor.check_size(count, *shape)
+        predictor.model.check_size(count, *shape)
     folder = checkouts or clones_folder()
     evaluator, results = CaptureEvaluator(predictor, load_lpips()), []
     for entry in progress(chosen, "evaluating"):
@@ -291,7 +291,7 @@ def _save_strip(out: Path, name: str, strip: "np.ndarray") -> None:
 
 
 def _about(predictor: "Predictor") -> dict[str, Any]:
-    return {"model": {"path": str(predictor.path), **asdict(predictor.metadata)}}
+    return {"model": {"path": str(predictor.model.path), **asdict(predictor.metadata)}}
 
 
 def _write(

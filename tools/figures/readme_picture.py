@@ -31,7 +31,7 @@ def image(
     """Draw image, its depth, the view between from splats, the image there, and the other image."""
     cameras = read_cameras(scene / "transforms.json")
     predictor = Predictor(bundled_model())
-    height, width = predictor.size_for(cameras)
+    height, width = predictor.model.size_for(cameras)
     pairs = [(scene / cameras[view].name, cameras[view]) for view in (*CONTEXT, BETWEEN)]
     given = build_view_batch(pairs[: len(CONTEXT)], None, height, width)
     found = predictor.predict_views(given)

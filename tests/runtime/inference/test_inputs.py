@@ -26,7 +26,7 @@ VIEWS = 8
 class SmallModel:
     """What `read_inputs` asks of a model."""
 
-    description = SimpleNamespace(fixed_views=None, fixed_size=False, height=64, width=96, size_multiple=32)
+    metadata = SimpleNamespace(fixed_views=None, fixed_size=False, height=64, width=96, size_multiple=32)
 
     def size_for(self, cameras):
         return 64, 96
