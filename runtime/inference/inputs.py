@@ -16,19 +16,11 @@ from ..images.resizing import cover_crop
 from ..images.sizes import nearest_size, parse_size
 from ..system.files import scratch_folder
 from ..system.progress import working
-<<<<<<< HEAD
 from ..views.batch import ViewBatch, build_view_batch, match_images_to_cameras
 from ..views.loader import ImageCameraPair
 from ..views.selection import MIN_VIEWS
 from ..views.sources import find_input_images
-from .predictor import Predictor
-=======
-from ..views.batch import Views, match, prepare
-from ..views.loader import Pair
-from ..views.selection import FEWEST_VIEWS
-from ..views.sources import find_photographs
 from .model_files import ModelFiles
->>>>>>> 80db4d5 (Read a model's metadata without opening a session)
 
 DEFAULT_VIEWS = 2
 # What --frames takes beside names and numbers: 0-3 is 0, 1, 2, 3; 0:8:2 is 0, 2, 4, 6, as Python has it.
@@ -78,54 +70,32 @@ def read_inputs(request: Request, model: ModelFiles) -> Inputs:
             from ..sfm.estimate import estimate_cameras
 
             images = pick_frames(images, request.frames)
-<<<<<<< HEAD
-            wanted = _wanted(request, predictor, images)
+            wanted = _wanted(request, model, images)
             skipped: list[str] = []
             cameras = estimate_cameras(images, request.focal, None if request.frames else skipped, decoded)
             notes += skipped
             notes.append(_estimated(len(images) - len(skipped), cameras))
-=======
-            wanted = _wanted(request, model, images)
-            left_out: list[str] = []
-            cameras = estimate_cameras(images, request.focal, None if request.frames else left_out, decoded)
-            notes += left_out
-            notes.append(_estimated(len(images) - len(left_out), cameras))
->>>>>>> 80db4d5 (Read a model's metadata without opening a session)
             images = [Path(camera.name) for camera in cameras]
         else:
             with working("reading cameras"):
                 cameras = read_cameras(given, images, request.camera_format)
             images = pick_frames(images, request.frames)
-<<<<<<< HEAD
-            wanted = _wanted(request, predictor, images)
-        pairs = match_images_to_cameras(images, cameras)
-=======
             wanted = _wanted(request, model, images)
-        pairs = match(images, cameras)
->>>>>>> 80db4d5 (Read a model's metadata without opening a session)
+        pairs = match_images_to_cameras(images, cameras)
         if request.frames is None and len(cameras) > len(pairs):
             notes.append(f"{len(cameras) - len(pairs)} of {len(cameras)} cameras have no photograph among those given")
         own = [camera if path.parent != folder else replace(camera, name=path.name) for path, camera in pairs]
         height, width = parse_size(request.size) if request.size else model.size_for(own)
         count = min(wanted or len(pairs), len(pairs))
-<<<<<<< HEAD
-        predictor.check_size(max(count, MIN_VIEWS), height, width)
-=======
-        model.check_size(max(count, FEWEST_VIEWS), height, width)
->>>>>>> 80db4d5 (Read a model's metadata without opening a session)
+        model.check_size(max(count, MIN_VIEWS), height, width)
         with working("choosing and reading photographs"):
             read: list[ImageCameraPair] = [(decoded.get(path, path), camera) for path, camera in pairs]
             views = build_view_batch(read, count, height, width, skip_damaged=request.frames is None)
     notes += [f"{line}; left out" for line in views.skipped]
     if request.views and request.views > len(pairs):
         notes.append(f"--views {request.views}: all {len(pairs)} photographs used; there are no more with a camera")
-<<<<<<< HEAD
-    notes += _cut(views.cameras[0], height, width, predictor)
-    if views.selection_reason:
-=======
     notes += _cut(views.cameras[0], height, width, model)
-    if views.choice:
->>>>>>> 80db4d5 (Read a model's metadata without opening a session)
+    if views.selection_reason:
         notes.append(
             f"{count} of {len(pairs)} photographs used: {', '.join(views.names)}; {views.selection_reason} "
             "(--views for more, --frames to choose)"

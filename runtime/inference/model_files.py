@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ..cameras.camera import Camera
 from ..errors import InputError
-from ..images.sizes import size_fits, size_rule
+from ..images.sizes import describe_size_rule, is_valid_size
 from ..system.files import open_regular
 from .metadata import INPUTS, ModelMetadata, StageFile, promised, read_manifest, read_metadata
 from .metadata_fields import shown
@@ -71,8 +71,8 @@ class ModelFiles:
                 f"{self.path}: was exported for {own.height}x{own.width} and got {height}x{width}; "
                 f"use --size {own.height}x{own.width}, or export without --size"
             )
-        if not size_fits(height, width, own.size_multiple):
-            rule = size_rule(own.size_multiple)
+        if not is_valid_size(height, width, own.size_multiple):
+            rule = describe_size_rule(own.size_multiple)
             raise InputError(f"{self.path}: cannot take images of {height}x{width}; {rule}")
 
     def _fixed(self) -> str:

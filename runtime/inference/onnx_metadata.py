@@ -12,7 +12,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
-from ..errors import refuse
+from ..errors import raise_input_error
 from ..system.files import open_regular
 
 METADATA_PROPS = 14  # of ModelProto: repeated StringStringEntryProto
@@ -39,11 +39,11 @@ def read_properties(path: Path) -> dict[str, str]:
                     name, value = _entry(file.read(length))
                     properties[name] = value
     except OSError as error:
-        refuse(path, f"cannot be read ({error.strerror})", "expected a .onnx file")
+        raise_input_error(path, f"cannot be read ({error.strerror})", "expected a .onnx file")
     except UnicodeDecodeError:
-        refuse(path, "damaged: its metadata is not UTF-8", "export it again")
+        raise_input_error(path, "damaged: its metadata is not UTF-8", "export it again")
     except ValueError as error:
-        refuse(path, f"no ONNX model, or damaged ({error})", "expected a .onnx file made by idesplat export")
+        raise_input_error(path, f"no ONNX model, or damaged ({error})", "expected a .onnx file made by idesplat export")
     return properties
 
 

@@ -8,25 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from ..cameras.camera import Camera
-<<<<<<< HEAD
 from ..errors import InputError, error_context
 from ..images.arrays import as_uint8_image
-from ..images.sizes import describe_size_rule, is_valid_size
 from ..splats.gaussians import Gaussians
 from ..views.batch import ViewBatch, build_view_batch, check_view_arrays
 from ..views.depth_range import DepthRange, estimate_depth_range
-from .graph_check import check_file, check_fused, check_results, check_stage, promised
-from .metadata import INPUTS, ModelMetadata, StageFile, read_manifest, read_metadata
-=======
-from ..errors import InputError, located
-from ..images.arrays import eight_bit_image
-from ..splats.gaussians import Gaussians
-from ..views.batch import Views, check_views, prepare
-from ..views.depth_range import DepthRange, find_depth_range
 from .graph_check import check_fused, check_results, check_stage
 from .metadata import ModelMetadata, StageFile, promised
 from .model_files import ModelFiles, read_model
->>>>>>> 80db4d5 (Read a model's metadata without opening a session)
 from .normalization import SceneNormalization
 from .session import CPU, DEFAULT, SessionConfig, open_session, provider_name, run_limit_s, run_session
 
@@ -144,13 +133,8 @@ class Predictor:
         result, in that unit.
         Raises InputError for anything the model cannot take.
         """
-<<<<<<< HEAD
         check_view_arrays(images, extrinsics, intrinsics, near, far)
-        self.check_size(len(images), *np.shape(images)[2:])
-=======
-        check_views(images, extrinsics, intrinsics, near, far)
         self.model.check_size(len(images), *np.shape(images)[2:])
->>>>>>> 80db4d5 (Read a model's metadata without opening a session)
         arrays = np.asarray(images), np.asarray(extrinsics), np.asarray(intrinsics)
         if near is None or far is None:
             trained = self.metadata.near, self.metadata.far
@@ -205,52 +189,7 @@ class Predictor:
 
     def end_profiling(self) -> list[Path]:
         """Stop noting operators, where `config.profile` asked for it; the files of notes, one for each stage."""
-<<<<<<< HEAD
-        return [Path(session.end_profiling()) for _, session in self._stages]
-
-    def size_for(self, cameras: Sequence[Camera]) -> tuple[int, int]:
-        """The trained height and width, turned upright where most pictures are and the model leaves the choice."""
-        own = self.metadata
-        upright = sum(camera.height > camera.width for camera in cameras) * 2 > len(cameras)
-        turn = upright and own.width > own.height and not own.fixed_size
-        return (own.width, own.height) if turn else (own.height, own.width)
-
-    def view_count(self, asked: int | None, named: int | None, default: int | None) -> int | None:
-        """How many views to use; None for all.
-
-        asked: by --views. named: how many images --frames names. default: where neither says so, and the model takes
-        any number.
-        Raises InputError where the model was exported for a number of views, and another is asked for.
-        """
-        fixed = self.metadata.fixed_views
-        if not fixed:
-            return asked or (None if named else default)
-        if asked is not None and asked != fixed:
-            raise InputError(f"--views {asked}: {self._fixed()}; use --views {fixed}, or export without --views")
-        if named is not None and (named < fixed or (named > fixed and asked is None)):
-            more = "" if named < fixed else f", or add --views {fixed} to have the best of them chosen"
-            raise InputError(f"--frames names {named} images: {self._fixed()}; name {fixed}{more}")
-        return fixed
-
-    def _fixed(self) -> str:
-        return f"{self.path} was exported for {self.metadata.fixed_views} views"
-
-    def check_size(self, views: int, height: int, width: int) -> None:
-        """Raise InputError unless the model takes this many views of this size."""
-        own = self.metadata
-        if own.fixed_views and views != own.fixed_views:
-            raise InputError(f"{self._fixed()} and got {views}; give {own.fixed_views}, or export without --views")
-        if own.fixed_size and (height, width) != (own.height, own.width):
-            raise InputError(
-                f"{self.path}: was exported for {own.height}x{own.width} and got {height}x{width}; "
-                f"use --size {own.height}x{own.width}, or export without --size"
-            )
-        if not is_valid_size(height, width, own.size_multiple):
-            rule = describe_size_rule(own.size_multiple)
-            raise InputError(f"{self.path}: cannot take images of {height}x{width}; {rule}")
-=======
         return [Path(session.end_profiling()) for session in self._sessions]
->>>>>>> 80db4d5 (Read a model's metadata without opening a session)
 
     def _run(self, values: dict[str, np.ndarray], frame: SceneNormalization) -> Prediction:
         path, seconds = self.model.path, {}
@@ -258,19 +197,11 @@ class Predictor:
         limit_s = run_limit_s(views * height * width)
         for stage, session, keep in zip(self.model.stages, self._sessions, self._keep, strict=True):
             started = time.perf_counter()
-<<<<<<< HEAD
-            with error_context(str(self.path) if stage.name == FUSED else f"{self.path}: stage {stage.name}"):
+            with error_context(f"{path}: stage {stage.name}" if path.is_dir() else str(path)):
                 values.update(run_session(session, values, stage.outputs, limit_s))
             seconds[stage.name] = time.perf_counter() - started
             values = {name: value for name, value in values.items() if name in keep}
-        with error_context(str(self.path)):
-=======
-            with located(f"{path}: stage {stage.name}" if path.is_dir() else str(path)):
-                values.update(run_session(session, values, stage.outputs, limit_s))
-            seconds[stage.name] = time.perf_counter() - started
-            values = {name: value for name, value in values.items() if name in keep}
-        with located(str(path)):
->>>>>>> 80db4d5 (Read a model's metadata without opening a session)
+        with error_context(str(path)):
             check_results(values, views, height, width, self.metadata)
         gaussians = None
         if self.metadata.gaussians:
