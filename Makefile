@@ -2,17 +2,18 @@ VENV ?= .venv
 PYTHON ?= python3
 BIN := $(VENV)/bin
 # Two processes of one thread each are faster than one of two threads: most tests are too small to share out.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --quiet -n 2 --dist loadfile
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --quiet -n 2 --dist loadfile --no-loadscope-reorder
 
 .PHONY: setup test quick check docs demo weights clean
 
 setup: $(VENV)/.ready
 
-# One virtual environment with everything the tests and tools need.
-$(VENV)/.ready: pyproject.toml constraints.txt
+# One virtual environment with everything the tests and tools need; with Node.js also the npm packages of some tests.
+$(VENV)/.ready: pyproject.toml constraints.txt tests/npm/package-lock.json
 	rm -rf build
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[dev]"
+	if command -v npm > /dev/null; then npm ci --prefix tests/npm --silent --no-audit --no-fund; fi
 	mkdir -p .typing/idesplat
 	for part in *.py py.typed model export runtime tools; do ln -sfn ../../$$part .typing/idesplat/$$part; done
 	touch $@
@@ -59,4 +60,4 @@ weights: setup runs/textures
 	$(BIN)/python -P -m idesplat.tools.training.release runs/head/last.ckpt --preset idesplat-lite
 
 clean:
-	rm -rf $(VENV) build .typing *.egg-info
+	rm -rf $(VENV) build site .typing tests/npm/node_modules *.egg-info

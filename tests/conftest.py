@@ -1,4 +1,9 @@
-"""A network of a tenth of the parameters, exported once, and photographs of a scene, drawn once."""
+"""Settings of all tests, and what many of them share: a small network, its export, a synthetic scene, a browser.
+
+The fixtures of scope `session` are made once in a run, also where it has several processes (pytest-xdist): see
+support/shared_fixtures.py. Call a command with `run_command` in the test's own process; a subprocess costs the imports
+again.
+"""
 
 import os
 import shutil
@@ -14,10 +19,17 @@ os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(Path(__file__).parent.parent / ".pyt
 import idesplat.runtime  # noqa: F401  # first: it switches ONNX Runtime's telemetry off
 import pytest
 import torch
+from hypothesis import settings
 from idesplat.model.config import PRESETS, DPBUConfig, DPTConfig, FocusConfig, IDESplatConfig, UNetConfig, ViTConfig
 from idesplat.model.idesplat.network import IDESplat
+from shared_fixtures import build_once
+
+# No limit on an example's time: a busy machine is no fault of the code.
+settings.register_profile("idesplat", deadline=None)
+settings.load_profile("idesplat")
 
 SMALL_PRESET = "idesplat-small"
+CHECKPOINT_NAME = "idesplat-small.pth"
 SMALL = IDESplatConfig(
     backbone_channels=(16, 24, 32),
     feature_channels=32,
@@ -42,12 +54,12 @@ def small_network() -> IDESplat:
     return IDESplat(SMALL).eval()
 
 
-# For `preexec_fn`: a shell starts commands in the background with SIGINT ignored, and what is ignored stays so.
-USUAL_SIGINT = None if os.name == "nt" else partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+# For `preexec_fn`: a shell starts background commands with SIGINT ignored, and children inherit that.
+DEFAULT_SIGINT = None if os.name == "nt" else partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
 
 
 def run_command(main, *arguments) -> int:
-    """Call a console script's entry point as the shell would; its exit status."""
+    """Call a command's entry point in this process, with these arguments on its command line; its exit status."""
     before = sys.argv
     sys.argv = ["command", *map(str, arguments)]
     try:
@@ -59,9 +71,18 @@ def run_command(main, *arguments) -> int:
     return 0
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip tests of POSIX on Windows, and run the files with slow tests first, so that two processes end together."""
+    for item in items:
+        if os.name == "nt" and item.get_closest_marker("posix"):
+            item.add_marker(pytest.mark.skip(reason="needs POSIX"))
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)
+
+
 @pytest.fixture(scope="session", autouse=True)
 def own_cache(tmp_path_factory):
-    """Keep the user's cache folder out of it."""
+    """Give the tests a cache folder of their own instead of the user's."""
     before = os.environ.get("XDG_CACHE_HOME")
     os.environ["XDG_CACHE_HOME"] = str(tmp_path_factory.mktemp("cache"))
     yield
@@ -81,9 +102,13 @@ def presets():
 
 @pytest.fixture(scope="session")
 def small_checkpoint(tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("checkpoint") / "idesplat-small.pth"
-    torch.save(small_network().state_dict(), path)
-    return path
+    """The small network's weights, as a release saves them."""
+    folder = build_once(
+        tmp_path_factory,
+        "checkpoint",
+        lambda folder: torch.save(small_network().state_dict(), folder / CHECKPOINT_NAME),
+    )
+    return folder / CHECKPOINT_NAME
 
 
 @pytest.fixture(scope="session")
@@ -91,25 +116,27 @@ def exported(small_checkpoint, presets, tmp_path_factory) -> tuple[Path, Path]:
     """The small network as a fused file and as a staged folder, through the command."""
     from idesplat.export.cli import main
 
-    folder = tmp_path_factory.mktemp("exported")
-    fused, staged = folder / "model.onnx", folder / "staged"
-    assert run_command(main, small_checkpoint, fused, "--staged", staged) == 0
-    return fused, staged
+    def export(folder: Path) -> None:
+        arguments = (small_checkpoint, folder / "model.onnx", "--staged", folder / "staged")
+        assert run_command(main, *arguments) == 0
+
+    folder = build_once(tmp_path_factory, "exported", export)
+    return folder / "model.onnx", folder / "staged"
 
 
 @pytest.fixture(scope="session")
 def scene(tmp_path_factory) -> Path:
-    """A folder with five photographs of a procedural room and transforms.json."""
+    """A folder with five images of a synthetic room, 96 x 128, their depth, and transforms.json."""
     from idesplat.tools.synthetic.make_scene import make_scene
 
-    folder = tmp_path_factory.mktemp("scene")
-    make_scene(folder, seed=2, views=5, height=96, width=128)
-    return folder
+    return build_once(
+        tmp_path_factory, "scene", lambda folder: make_scene(folder, seed=2, views=5, height=96, width=128)
+    )
 
 
 @pytest.fixture(scope="session")
 def browser():
-    """Chromium without a window, which draws by itself what a graphics card would."""
+    """Headless Chromium, which renders WebGL on the CPU."""
     path = shutil.which("chromium") or shutil.which("google-chrome")
     if path is None:
         pytest.skip("neither chromium nor google-chrome is installed")

@@ -229,10 +229,7 @@ def each_kill(action, restore):
     pytest.fail("the action never ended")
 
 
-posix = pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked")
-
-
-@posix
+@pytest.mark.posix
 @pytest.mark.parametrize("exchange", (True, False))
 def test_a_staged_folder_is_the_old_or_the_new_one_wherever_a_run_is_killed(exchange, tmp_path, monkeypatch):
     """Where folders cannot be exchanged, once the next run has begun."""
@@ -264,7 +261,7 @@ def test_a_staged_folder_is_the_old_or_the_new_one_wherever_a_run_is_killed(exch
     assert len(found) > 5
 
 
-@posix
+@pytest.mark.posix
 def test_a_graph_and_its_weights_belong_together_wherever_a_run_is_killed(tmp_path, monkeypatch):
     monkeypatch.setattr(weights, "LARGEST_FILE", 1000)
     place, source = tmp_path / "place", tmp_path / "source"

@@ -167,6 +167,7 @@ ERRORS = {
 }
 
 
+@pytest.mark.posix
 @pytest.mark.parametrize("name", ERRORS)
 def test_errors_are_one_line(name, small_checkpoint, presets, tmp_path, monkeypatch, capsys):
     arguments, expected = ERRORS[name]

@@ -226,7 +226,7 @@ def test_a_packed_archive_is_refused_before_it_is_unpacked(tmp_path):
         read_state_dict(path)
 
 
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="named pipes are of POSIX")
+@pytest.mark.posix
 @pytest.mark.parametrize("read", (read_state_dict, file_sha256))
 def test_a_named_pipe_and_a_name_that_is_too_long_are_refused(tmp_path, read):
     os.mkfifo(tmp_path / "pipe.pth")

@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from conftest import USUAL_SIGINT
+from conftest import DEFAULT_SIGINT
 from idesplat.runtime.inference.bundled_model import bundled_model
 from idesplat.runtime.splats.formats.ply import write_ply
 from idesplat.runtime.splats.gaussians import with_colours
@@ -23,7 +23,6 @@ from idesplat.tools.evaluation.report import print_views
 
 COLUMNS = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2")
 COLUMNS += ("rot_0", "rot_1", "rot_2", "rot_3")
-POSIX = pytest.mark.skipif(os.name == "nt", reason="pipes and signals of POSIX")
 MODEL = {  # of COLMAP, as its documentation writes it
     "cameras.txt": "1 PINHOLE 640 480 500 500 320 240\n",
     "images.txt": "1 1 0 0 0 0 0 1 1 a.png\n\n2 1 0 0 0 1 0 1 1 b.png\n\n",
@@ -142,7 +141,7 @@ def test_texts_name_the_safe_way_to_run_modules():
 # ---- what is left behind
 
 
-@POSIX
+@pytest.mark.posix
 def test_nothing_but_our_cache_is_left_behind(scene, tmp_path):
     """Neither ONNX Runtime's device id and events nor a temporary file."""
     home, temporary, work = (tmp_path / name for name in ("home", "tmp", "work"))
@@ -190,7 +189,7 @@ LEFT += "with atomic_write(Path(sys.argv[1])) as temporary:\n"
 LEFT += "    temporary.write_text('half')\n    print('writing', flush=True)\n    time.sleep(600)\n"
 
 
-@POSIX
+@pytest.mark.posix
 def test_what_killed_processes_left_is_collected(tmp_path):
     """By the next process, and not while the one that it belongs to is alive."""
     out = tmp_path / "out.json"
@@ -216,7 +215,7 @@ def write_elsewhere(folder: Path) -> None:
     subprocess.run([sys.executable, "-P", "-c", code, folder / "other"], check=True, timeout=60)
 
 
-@POSIX
+@pytest.mark.posix
 def test_a_folder_that_was_not_locked_yet_is_made_again(tmp_path, monkeypatch):
     """Another process may take a new folder for an abandoned one, in the moment before it is locked."""
     from idesplat.runtime.system import files
@@ -262,13 +261,14 @@ run(wait)
 """
 
 
-@POSIX
-@pytest.mark.parametrize("number, status", [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
-def test_signals_clean_up(tmp_path, number, status):
+@pytest.mark.posix
+@pytest.mark.parametrize("name, status", [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
+def test_signals_clean_up(tmp_path, name, status):
+    number = getattr(signal, name)
     out = tmp_path / "out.txt"
     command = [sys.executable, "-P", "-c", WAITING, out]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    waiting = subprocess.Popen(command, **pipes, preexec_fn=USUAL_SIGINT)
+    waiting = subprocess.Popen(command, **pipes, preexec_fn=DEFAULT_SIGINT)
     assert waiting.stdout.readline() == "waiting\n"
     waiting.send_signal(number)
     printed = waiting.communicate(timeout=60)
@@ -287,7 +287,7 @@ def test_ctrl_c_while_a_command_is_loaded(tmp_path, monkeypatch, capsys):
     assert capsys.readouterr() == ("", "")
 
 
-@POSIX
+@pytest.mark.posix
 def test_what_the_caller_ignores_stays_ignored(tmp_path):
     command = ["nohup", sys.executable, "-P", "-c", WAITING, tmp_path / "out.txt"]
     waiting = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -302,7 +302,7 @@ def test_what_the_caller_ignores_stays_ignored(tmp_path):
 # ---- what reaches the terminal
 
 
-@POSIX
+@pytest.mark.posix
 def test_full_standard_output(tmp_path):
     scene = write_scene(tmp_path / "scene.ply")
     with open("/dev/full", "w") as full:
@@ -313,7 +313,7 @@ def test_full_standard_output(tmp_path):
     assert done.stderr.count("\n") == 1
 
 
-@POSIX
+@pytest.mark.posix
 @pytest.mark.parametrize("arguments", [("scene.ply", "out.splat"), ("--help",)], ids=["results", "help"])
 def test_closed_pipe(tmp_path, arguments):
     write_scene(tmp_path / "scene.ply")
@@ -326,7 +326,7 @@ def test_closed_pipe(tmp_path, arguments):
     assert done.returncode in (1, 141)
 
 
-@POSIX
+@pytest.mark.posix
 def test_streams_that_are_closed(tmp_path):
     scene = write_scene(tmp_path / "scene.ply")
     code = "from idesplat.runtime.cli.convert import main; main()"
@@ -343,7 +343,7 @@ def test_output_in_ascii(tmp_path):
     assert "Fu\\xdf-\\u96ea.splat" in done.stdout
 
 
-@POSIX
+@pytest.mark.posix
 @pytest.mark.parametrize("there", [True, False], ids=["result", "error"])
 def test_control_characters_are_not_printed(tmp_path, there):
     """A name that would clear the screen, go back in the line, turn the text around, or is not UTF-8."""
@@ -431,7 +431,7 @@ def test_warnings_of_image_decoders_are_not_shown(tmp_path):
     assert (done.returncode, done.stderr) == (2, "error: the one line\n")
 
 
-@POSIX
+@pytest.mark.posix
 @pytest.mark.parametrize("name", ["scene.splat", "scene.spz", "scene.ply", "scene.glb"])
 def test_files_larger_than_memory(tmp_path, name):
     scene = tmp_path / name
@@ -461,7 +461,7 @@ OTHERS = ("model.onnx", "index.json", "rows.json", "chunk.torch")
 ELSEWHERE = ("a.png", "manifest.json", "clip.mp4", "captures.json", "log.jsonl", "a.ckpt", "a.safetensors")
 
 
-@POSIX
+@pytest.mark.posix
 @pytest.mark.parametrize("kind", ["a named pipe", "a device", "a socket", "a folder"])
 def test_readers_take_regular_files_alone(tmp_path, kind):
     """In one process, whose limit ends what would hang; every reader names what it met."""
@@ -537,7 +537,7 @@ def make_special(path: Path, kind: str, listener: socket.socket) -> None:
             os.chdir(before)
 
 
-@POSIX
+@pytest.mark.posix
 def test_a_pipe_in_the_cache_is_replaced(tmp_path, monkeypatch):
     from idesplat.runtime.inference import graph_cache
     from idesplat.runtime.inference.session import open_session
@@ -551,7 +551,7 @@ def test_a_pipe_in_the_cache_is_replaced(tmp_path, monkeypatch):
     assert len(list(place.folder.iterdir())) == 1
 
 
-@POSIX
+@pytest.mark.posix
 def test_what_was_left_in_the_cache_is_collected(tmp_path, monkeypatch):
     from idesplat.runtime.inference import graph_cache
     from idesplat.runtime.system import files
@@ -565,7 +565,7 @@ def test_what_was_left_in_the_cache_is_collected(tmp_path, monkeypatch):
     assert not left.exists()
 
 
-@POSIX
+@pytest.mark.posix
 def test_a_pipe_in_a_colmap_model_is_refused(tmp_path):
     for name, text in MODEL.items():
         (tmp_path / name).write_text(text)

@@ -49,7 +49,6 @@ def tried(examples: int) -> settings:
         max_examples=EXAMPLES or examples,
         derandomize=not EXAMPLES,
         phases=(Phase.explicit, Phase.generate) if EXAMPLES else tuple(Phase),
-        deadline=None,
         database=None,
         suppress_health_check=list(HealthCheck),
     )

@@ -40,7 +40,7 @@ WORDS = [
     "\x00",
 ]
 NUMBERS = st.sampled_from([np.nan, np.inf, -1.0, 0.0, 1e300, 1e-300, 2.0**62])
-quick = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+quick = settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @pytest.fixture(scope="module")

@@ -307,7 +307,7 @@ def test_own_format_distortion_is_a_list_of_numbers(tmp_path, cameras, bad):
 
 # ---- nothing but an InputError or cameras, whatever the file holds
 
-fuzz = settings(max_examples=100, deadline=2000, suppress_health_check=[HealthCheck.function_scoped_fixture])
+fuzz = settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
 scalars = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8) | st.just(10**400)
 values = st.recursive(scalars, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=4), inner))
 FIELDS = [

@@ -192,6 +192,7 @@ def test_infer_never_replaces_photographs_that_only_the_cameras_name(dataset, ca
     assert "would replace a photograph" in refused(capfd, dataset, infer, *given, *option, "--overwrite")
 
 
+@pytest.mark.posix
 def test_infer_leaves_what_is_not_its_own(workplace, capfd):
     given = [part for option in USUAL.items() for part in option]
     line = refused(capfd, workplace, infer, *given, "--json", "notes.json")
@@ -322,6 +323,7 @@ def test_without_a_cache_folder_files_are_kept(tmp_path, monkeypatch):
     assert Outputs("two").writer_of(tmp_path / "cache.txt") is None
 
 
+@pytest.mark.posix
 def test_a_damaged_or_long_record(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     out = tmp_path / "out"
@@ -344,6 +346,7 @@ def test_a_damaged_or_long_record(tmp_path, monkeypatch):
         write(out / "c.txt")
 
 
+@pytest.mark.posix
 def test_devices_and_impossible_names_are_refused(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     os.mkfifo("pipe")

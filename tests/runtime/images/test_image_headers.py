@@ -158,7 +158,7 @@ def test_a_header_that_does_not_fit_its_pixels_is_damage(tmp_path, monkeypatch):
 
 
 @given(at=st.integers(0, 400), replacement=st.binary(min_size=1, max_size=6), kind=st.sampled_from(range(5)))
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_mutated_headers_are_read_or_refused(tmp_path, at, replacement, kind, monkeypatch):
     monkeypatch.setenv("IDESPLAT_MAX_MEGAPIXELS", "1")
     name = ("PNG", "JPEG", "TIFF", "WEBP", "AVIF")[kind]

@@ -50,7 +50,7 @@ JSON = st.recursive(
 HUGE = st.sampled_from((10**400, -(10**400), float("nan"), float("inf"), "\x00", "\ud800", "x" * 10_000, [[]] * 1000))
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(field=st.sampled_from(sorted(asdict(OWN))), value=JSON | HUGE)
 def test_a_field_of_metadata_is_right_or_refused(field: str, value: object) -> None:
     content = asdict(OWN) | {field: value}
@@ -68,7 +68,7 @@ def test_a_field_of_metadata_is_right_or_refused(field: str, value: object) -> N
     assert 0 < read.near < read.far < float("inf")
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(content=JSON | st.text() | HUGE)
 def test_metadata_of_any_kind_is_refused(content: object) -> None:
     text = content if isinstance(content, str) else json.dumps(content)
@@ -125,7 +125,7 @@ def staged(tmp_path: Path) -> Path:
     return tmp_path
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(data=st.data(), value=JSON | HUGE)
 def test_a_manifest_is_right_or_refused(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject, value) -> None:
     folder = tmp_path_factory.mktemp("staged")
@@ -341,6 +341,7 @@ def external_model(path: Path, location: str) -> Path:
     return path
 
 
+@pytest.mark.posix
 @pytest.mark.parametrize(
     ("location", "expected"),
     (
@@ -366,6 +367,7 @@ def test_weights_outside_the_folder_are_not_read(tmp_path: Path, location: str, 
     one_line(error)
 
 
+@pytest.mark.posix
 def test_files_that_are_no_graphs(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     whole = write_model(tmp_path / "model.onnx").read_bytes()
     damaged = bytearray(whole)

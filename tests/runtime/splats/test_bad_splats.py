@@ -336,7 +336,7 @@ def test_broken_glb_files_are_named(tmp_path: Path, written: dict[str, bytes], n
 SNIPPETS = [b"9", b"-", b"null", b"[", b"{}", b"1e999", b"NaN", b'"x"', b"\xff\xff\xff\xff", b"\0\0\0\0"]
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @pytest.mark.parametrize("suffix", [*FORMATS, VERSION_4])
 @given(data=st.data())
 def test_any_mutation_gives_a_scene_or_an_input_error(

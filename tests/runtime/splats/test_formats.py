@@ -37,8 +37,6 @@ from splat_cases import (
     without_bands,
 )
 
-SPLAT_TRANSFORM = "@playcanvas/splat-transform@2.7.1"
-
 
 @pytest.fixture(scope="module")
 def truth() -> Gaussians:
@@ -152,23 +150,12 @@ def test_we_read_what_others_wrote(truth: Gaussians, name: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def splat_transform() -> str:
-    """The command of PlayCanvas' splat-transform, which npx fetches once and keeps."""
-    return run_npx(SPLAT_TRANSFORM, ["sh", "-c", "command -v splat-transform"]).split()[-1]
-
-
-def run_npx(package: str, command: list[str]) -> str:
-    """What a command prints where an npm package is at hand, which npx fetches once and keeps; skips without it."""
-    if shutil.which("npx") is None:
-        pytest.skip(f"npx (Node.js) is not installed, so {package} cannot try our files")
-    fetch = ["npx", "--yes", "--package", package, "--"]
-    try:
-        there = subprocess.run([*fetch, "node", "--version"], capture_output=True, timeout=180, check=False, text=True)
-    except subprocess.TimeoutExpired:
-        pytest.skip(f"npx did not fetch {package} within three minutes")
-    if there.returncode:
-        pytest.skip(f"npx cannot fetch {package}: {there.stderr[-300:]}")
-    return subprocess.run([*fetch, *command], capture_output=True, timeout=180, check=True, text=True).stdout
+def npm_modules() -> Path:
+    """The npm packages that `make setup` installs where Node.js is."""
+    folder = Path(__file__).parents[2] / "npm" / "node_modules"
+    if shutil.which("node") is None or not folder.is_dir():
+        pytest.skip("Node.js or tests/npm/node_modules is missing (make setup)")
+    return folder
 
 
 def read_with_plyfile(path: Path, degree: int) -> Gaussians:
@@ -190,12 +177,11 @@ def read_with_plyfile(path: Path, degree: int) -> Gaussians:
 
 
 @pytest.mark.parametrize("suffix", [suffix for suffix in FORMATS if suffix != ".glb"])  # which it only writes
-def test_splat_transform_reads_what_we_wrote(
-    tmp_path: Path, truth: Gaussians, splat_transform: str, suffix: str
-) -> None:
+def test_splat_transform_reads_what_we_wrote(tmp_path: Path, truth: Gaussians, npm_modules: Path, suffix: str) -> None:
     degree = min(2, highest_degree(suffix))
     write_splats(tmp_path / f"ours{suffix}", truth)
-    command = [splat_transform, "-q", "-w", "-g", "cpu", tmp_path / f"ours{suffix}", tmp_path / "theirs.ply"]
+    program = npm_modules / ".bin" / "splat-transform"
+    command = [program, "-q", "-w", "-g", "cpu", tmp_path / f"ours{suffix}", tmp_path / "theirs.ply"]
     subprocess.run(command, check=True, capture_output=True, timeout=120)
     back = read_with_plyfile(tmp_path / "theirs.ply", degree)
     assert_close(back, truth, our_bounds(suffix, truth), in_order=suffix not in SORTED)
@@ -212,17 +198,16 @@ def test_trimesh_shows_a_glb_as_coloured_points(tmp_path: Path, truth: Gaussians
     np.testing.assert_allclose(points.colors[:, 3] / 255, truth.opacities, atol=0.5 / 255 + 1e-6)
 
 
-def test_the_official_validator_accepts_a_glb(tmp_path: Path, truth: Gaussians) -> None:
+def test_the_official_validator_accepts_a_glb(tmp_path: Path, truth: Gaussians, npm_modules: Path) -> None:
     """Khronos' own, which does not know the extension yet and therefore not the names of its attributes."""
     write_splats(tmp_path / "scene.glb", truth)
     program = (
-        "const path = require('path');"
-        "const folder = process.env.PATH.split(path.delimiter).find(p => p.includes('_npx'));"
-        "const validator = require(path.join(folder, '..', 'gltf-validator'));"
-        "validator.validateBytes(new Uint8Array(require('fs').readFileSync(process.argv[1])))"
+        "require('gltf-validator').validateBytes(new Uint8Array(require('fs').readFileSync(process.argv[1])))"
         ".then(report => console.log(JSON.stringify(report.issues)));"
     )
-    issues = json.loads(run_npx("gltf-validator@2.0.0-dev.3.10", ["node", "-e", program, str(tmp_path / "scene.glb")]))
+    command = ["node", "-e", program, tmp_path / "scene.glb"]
+    done = subprocess.run(command, cwd=npm_modules.parent, check=True, capture_output=True, timeout=120)
+    issues = json.loads(done.stdout)
     assert not issues["truncated"]
     named = {"MESH_PRIMITIVE_INVALID_ATTRIBUTE", "UNSUPPORTED_EXTENSION"}
     errors = [issue for issue in issues["messages"] if issue["severity"] <= 1]

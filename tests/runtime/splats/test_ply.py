@@ -252,7 +252,7 @@ def test_a_value_that_is_not_a_number_is_named(tmp_path: Path, name: str) -> Non
         read_ply(tmp_path / "foreign.ply")
 
 
-@settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=400, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_any_mutation_gives_a_scene_or_an_input_error(tmp_path: Path, splat_bytes: bytes, data: st.DataObject) -> None:
     content = bytearray(splat_bytes)

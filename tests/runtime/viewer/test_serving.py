@@ -2,7 +2,6 @@
 
 import http.client
 import http.server
-import os
 import shutil
 import signal
 import socket
@@ -13,7 +12,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from conftest import USUAL_SIGINT, run_command
+from conftest import DEFAULT_SIGINT, run_command
 from idesplat.runtime.cli.view import main
 from idesplat.runtime.splats.formats.ply import write_ply
 from idesplat.runtime.splats.gaussians import with_colours
@@ -55,7 +54,7 @@ def served(scene):
         command = [sys.executable, "-P", "-c", "from idesplat.runtime.cli.view import main; main()", str(scene)]
         command += ["--no-browser", *map(str, arguments)]
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-        processes.append(subprocess.Popen(command, **pipes, preexec_fn=USUAL_SIGINT))
+        processes.append(subprocess.Popen(command, **pipes, preexec_fn=DEFAULT_SIGINT))
         line = processes[-1].stdout.readline()
         return next(word for word in line.split() if word.startswith("http://")), processes[-1]
 
@@ -192,7 +191,7 @@ def test_a_server_that_cannot_be_guarded_is_not_used():
         pass
 
 
-@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+@pytest.mark.posix
 @pytest.mark.parametrize("number, status", [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
 def test_signals_end_it(served, number, status):
     _, process = served("--port", 0)

@@ -66,14 +66,12 @@ def test_a_killed_run_leaves_no_process_behind(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "idesplat.tools.training.cli", f"--out={tmp_path}", *options]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
     try:
-        deadline = time.monotonic() + 300
         while not (tmp_path / LOG).exists() or not (tmp_path / LOG).read_text():
-            assert process.poll() is None and time.monotonic() < deadline
+            assert process.poll() is None
             time.sleep(0.1)
         process.send_signal(signal.SIGKILL)
         process.wait()
         while _members(process.pid):
-            assert time.monotonic() < deadline
             time.sleep(0.1)
     finally:
         if _members(process.pid):
