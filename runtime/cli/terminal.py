@@ -26,6 +26,7 @@ from ..errors import (
     printable,
     report_error,
 )
+from .progress_bar import draw_progress
 
 STDERR = 2
 HELP_OPTIONS = {"help_option_names": ["-h", "--help"]}  # typer's settings of a context
@@ -39,7 +40,13 @@ def run(command: "Callable[..., Any] | typer.Typer") -> None:
     Ends it with SystemExit where the status is not 0: 2 for wrong arguments, 128 and the signal's number after a
     signal. While it runs, SIGTERM and SIGHUP clean up as Ctrl-C does, and libraries' warnings are not shown.
     """
-    with _ending_by_signals() as received, _own_streams(), _without_warnings(), _without_native_messages():
+    with (
+        _ending_by_signals() as received,
+        _own_streams(),
+        _without_warnings(),
+        _without_native_messages(),
+        draw_progress(),
+    ):
         status = _status(as_application(command))
     if received and status == SIGNALLED + signal.SIGINT:  # typer takes each for Ctrl-C
         status = SIGNALLED + received[-1]

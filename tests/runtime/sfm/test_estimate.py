@@ -106,7 +106,7 @@ def test_refusals(room, tmp_path, monkeypatch):
     blank = save(tmp_path / "blank.png", np.full_like(image, 128))
     noise = save(tmp_path / "noise.png", np.random.default_rng(0).integers(0, 255, image.shape, np.uint8))
     for pictures, given, expected in (
-        ([first], focal, "1 photograph given, expected two at least"),
+        ([first], focal, "1 image given, expected two at least"),
         ([first, second], None, "tells no focal length; give --focal"),
         ([first, second], "wide", "--focal wide: expected pixels"),
         ([first, second], "999999", r"000\.png: the focal lengths .* not plausible"),
@@ -114,7 +114,7 @@ def test_refusals(room, tmp_path, monkeypatch):
         ([first, rotated], focal, "too nearly the same place"),
         ([first, blank], focal, "0 points found in both, expected 40 at least"),
         ([first, noise], focal, "points found in both, expected"),
-        ([first, blank, noise], focal, "the 3 photographs do not fit together"),
+        ([first, blank, noise], focal, "the 3 images do not fit together"),
     ):
         with pytest.raises(InputError, match=expected) as caught:
             estimate_cameras(pictures, given)
