@@ -17,7 +17,7 @@ from ..runtime.inference.metadata import ModelMetadata, StageFile, write_manifes
 from ..runtime.system.files import check_writable, make_folder
 
 if TYPE_CHECKING:
-    from ..model.registry import Network
+    from ..model.common.network import Network
     from .stages import Stage
     from .tracing import Graphs, StaticShape
 
@@ -141,8 +141,7 @@ def _fitting_size(text: str, views: int | None, multiple: int) -> tuple[int, int
 def _load(checkpoint: Path, preset: str | None) -> "tuple[Network, str, str]":
     """The network with the file's weights, the preset's name, and the file's SHA-256."""
     from ..model.checkpoint import file_sha256, fill, infer_preset, name_hash_warning, read_state_dict
-    from ..model.config import PRESETS
-    from ..model.registry import build
+    from ..model.registry import PRESETS, build
 
     if preset is not None and preset not in PRESETS:
         raise InputError(f"--preset {preset}: unknown; choose one of {', '.join(PRESETS)}")
@@ -164,8 +163,6 @@ def describe(
     model: "Network", preset: str, checkpoint: str, digest: str, static: "StaticShape", precision: str = "float32"
 ) -> ModelMetadata:
     """What an exported network says of itself."""
-    from ..model.depthsplat.network import DepthSplatDepth
-
     config = model.config
     height, width = static.size or (config.height, config.width)
     return ModelMetadata(
@@ -183,7 +180,7 @@ def describe(
         checkpoint=checkpoint,
         checkpoint_sha256=digest,
         version=version("idesplat"),
-        gaussians=not isinstance(model, DepthSplatDepth),
+        gaussians=model.has_gaussians,
         precision=precision,
     )
 

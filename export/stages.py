@@ -5,15 +5,13 @@ them a later stage reads is not written down anywhere: it is read off the traced
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import onnx
 import torch
 from torch import Tensor, nn
 
-from ..model.depthsplat.depth_stage import DepthOutput
-from ..model.idesplat.gaussian_head import ModelOutput
-from ..model.registry import Network
+from ..model.common.network import Network
+from ..model.registry import family_of
 from ..runtime.inference.metadata import INPUTS
 from .graph.subgraph import extract_subgraph, names_read
 
@@ -28,12 +26,13 @@ class Stage:
 
 
 class NamedTensors(nn.Module):
-    """The network with everything that its stages yield as outputs, by name."""
+    """A network with every tensor between its stages as an output, by name."""
 
     def __init__(self, model: Network) -> None:
         super().__init__()
         self.model = model
-        self.stages = [name for name, _ in model.named_children()]
+        self.stages = model.stage_names
+        self.family = family_of(model.config)
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """The graph's inputs, as `INPUTS` names them -> the tensors of `named`, in its order."""
@@ -41,16 +40,7 @@ class NamedTensors(nn.Module):
 
     def named(self, *inputs: Tensor) -> dict[str, Tensor]:
         """The fields of every stage before the last, and the network's own outputs."""
-        named: dict[str, Tensor] = {}
-        parts: tuple[Any, ...] = self.model.stages(*inputs)
-        for stage, part in zip(self.stages, parts, strict=True):
-            if isinstance(part, ModelOutput):
-                named |= {"depth": part.depth, **part.gaussians._asdict()}
-            elif isinstance(part, DepthOutput):
-                named |= {"depth": part.depth}
-            else:
-                named |= {f"{stage}.{field}": value for field, value in part._asdict().items()}
-        return named
+        return self.model.named_tensors(*inputs)
 
 
 def find_stages(traced: onnx.ModelProto, names: list[str]) -> list[Stage]:

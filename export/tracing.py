@@ -73,7 +73,8 @@ class Graphs:
 def export_graphs(network: NamedTensors, description: ModelMetadata, static: StaticShape, folder: Path) -> Graphs:
     """Trace a network and cut it into stages, all as files in an empty folder, checked against ONNX's specification."""
     traced = trace(network, description, static, folder)
-    traced = convert_precision(description.precision, traced, folder / WEIGHTS, _examples(description, static))
+    layers, examples = network.family.quantizable, _examples(description, static)
+    traced = convert_precision(description.precision, traced, folder / WEIGHTS, layers, examples)
     whole = _whole_graph(traced)
     graphs = Graphs(folder, find_stages(traced, network.stages), len(whole.graph.node))
     _write(whole, description, graphs.whole)

@@ -1,15 +1,24 @@
-"""Every network this project knows, from its configuration or the name of a released checkpoint."""
+"""Every network that this project knows, by its configuration or by the name of a preset."""
 
-from .config import PRESETS, DepthSplatConfig, IDESplatConfig
-from .depthsplat.network import DepthSplat, DepthSplatDepth
-from .idesplat.network import IDESplat
+from .common.network import Network
+from .config import EncoderConfig
+from .depthsplat.family import DEPTHSPLAT
+from .family import Family
+from .idesplat.family import IDESPLAT
 
-Network = IDESplat | DepthSplat | DepthSplatDepth
+FAMILIES: tuple[Family, ...] = (IDESPLAT, DEPTHSPLAT)
+PRESETS: dict[str, EncoderConfig] = {name: config for family in FAMILIES for name, config in family.presets.items()}
 
 
-def build(preset: str | IDESplatConfig | DepthSplatConfig) -> Network:
+def family_of(config: EncoderConfig) -> Family:
+    """The family that a configuration belongs to. Raises TypeError if there is none."""
+    for family in FAMILIES:
+        if isinstance(config, family.config):
+            return family
+    raise TypeError(f"{type(config).__name__} is the configuration of no family in model/registry.py")
+
+
+def build(preset: str | EncoderConfig) -> Network:
     """The network of a preset's name or of a configuration, with initial weights. Raises KeyError if unknown."""
     config = PRESETS[preset] if isinstance(preset, str) else preset
-    if isinstance(config, IDESplatConfig):
-        return IDESplat(config)
-    return DepthSplat(config) if config.gaussians else DepthSplatDepth(config)
+    return family_of(config).build(config)

@@ -20,8 +20,10 @@ import idesplat.runtime  # noqa: F401  # first: it switches ONNX Runtime's telem
 import pytest
 import torch
 from hypothesis import settings
-from idesplat.model.config import PRESETS, DPBUConfig, DPTConfig, FocusConfig, IDESplatConfig, UNetConfig, ViTConfig
+from idesplat.model.config import DPTConfig, UNetConfig, ViTConfig
+from idesplat.model.idesplat.config import DPBUConfig, FocusConfig, IDESplatConfig
 from idesplat.model.idesplat.network import IDESplat
+from idesplat.model.registry import PRESETS
 from shared_fixtures import build_once
 
 # No limit on an example's time: a busy machine is no fault of the code.

@@ -24,7 +24,7 @@ ORDERS = {
         *("errors", "system", "startup", "geometry", "images", "cameras", "sfm", "views", "splats", "inference"),
         *("rendering", "viewer", "cli"),
     ),
-    "model": ("config", "common", "idesplat", "depthsplat", "registry", "checkpoint"),
+    "model": ("config", "common", "family", "idesplat", "depthsplat", "registry", "checkpoint"),
     "export": ("existing_exports", "graph", "stages", "room", "precision", "tracing", "validation", "pipeline", "cli"),
     "tools": ("processes", "synthetic", "training", "evaluation", "benchmark", "figures"),
 }

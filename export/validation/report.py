@@ -7,7 +7,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from .compare import FIGURE_NAMES, TensorError
+from .compare import QUANTILE_NAMES, TensorError
 
 TITLE = "ONNX Runtime against PyTorch: errors in standard deviations of each channel"
 LEGEND = (
@@ -27,12 +27,12 @@ def print_summary(errors: Sequence[TensorError]) -> None:
     table.add_column("verdict")
     for stage in dict.fromkeys(error.stage for error in errors):
         rows = [error for error in errors if error.stage == stage]
-        worst = max(rows, key=lambda row: max(row.shares))
-        figure = int(np.argmax(worst.shares))
+        worst = max(rows, key=lambda row: max(row.ratios))
+        figure = int(np.argmax(worst.ratios))
         checked = str(len({row.tensor for row in rows}))
         numbers = (f"{values[figure]:.1e}" for values in (worst.errors, worst.bounds))
         name = worst.tensor.removeprefix(f"{stage}.")
-        table.add_row(stage, checked, name, worst.case, FIGURE_NAMES[figure], *numbers, _verdict(worst))
+        table.add_row(stage, checked, name, worst.case, QUANTILE_NAMES[figure], *numbers, _verdict(worst))
     _console(SUMMARY_WIDTH).print(table)
 
 
@@ -41,7 +41,7 @@ def print_details(errors: Sequence[TensorError]) -> None:
     table = Table(title=TITLE)
     for column in ("case", "stage", "tensor"):
         table.add_column(column)
-    for column in (*(f"{name} / bound" for name in FIGURE_NAMES), "largest"):
+    for column in (*(f"{name} / bound" for name in QUANTILE_NAMES), "largest"):
         table.add_column(column, justify="right")
     table.add_column("verdict")
     for row in errors:

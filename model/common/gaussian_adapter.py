@@ -1,6 +1,5 @@
 """Depth and raw parameters to Gaussians in the world frame, in the usual 3DGS conventions (gaussian_adapter.py)."""
 
-import math
 from typing import NamedTuple
 
 import torch
@@ -9,14 +8,14 @@ from torch import Tensor, nn
 
 from ..config import EncoderConfig
 from .geometry import Cameras, invert_intrinsics, pixel_grid
+from .quaternions import quaternion_from_matrix, quaternion_product
+from .sh import SH_C0, harmonic_rotation
 
 # The releases shift the raw scale before softplus, so that splats start at about pixel size.
 SCALE_SHIFT = 4.0
 # Spherical harmonics of band l are multiplied by SH_SHARE * SH_DECAY**l, so that colour starts view-independent.
 SH_SHARE = 0.1
 SH_DECAY = 0.25
-# The constant value of the spherical harmonic of degree 0.
-SH_C0 = 0.28209479177387814
 QUATERNION_EPSILON = 1e-8
 # What a pixel's raw parameters begin with: opacity logit, offset x y, scales, quaternion xyzw in the camera's frame.
 # The harmonics come behind it.
@@ -94,84 +93,3 @@ def _normalise_quaternion(xyzw: Tensor) -> Tensor:
     """Raw xyzw -> unit wxyz."""
     unit = xyzw / (xyzw.norm(dim=-1, keepdim=True) + QUATERNION_EPSILON)
     return torch.cat([unit[..., 3:], unit[..., :3]], dim=-1)
-
-
-def quaternion_product(a: Tensor, b: Tensor) -> Tensor:
-    """The rotation b followed by a, all wxyz [..., 4]."""
-    aw, ax, ay, az = a.unbind(-1)
-    bw, bx, by, bz = b.unbind(-1)
-    product = [
-        aw * bw - ax * bx - ay * by - az * bz,
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-    ]
-    return torch.stack(product, dim=-1)
-
-
-def quaternion_from_matrix(rotation: Tensor) -> Tensor:
-    """Rotations [views, 3, 3] -> unit quaternions wxyz [views, 4], without a branch on the data.
-
-    Of the four usual solutions the one with the largest divisor is taken, which is never small.
-    """
-    m00, m01, m02, m10, m11, m12, m20, m21, m22 = rotation.flatten(-2).unbind(-1)
-    candidates = [
-        [1 + m00 + m11 + m22, m21 - m12, m02 - m20, m10 - m01],
-        [m21 - m12, 1 + m00 - m11 - m22, m10 + m01, m02 + m20],
-        [m02 - m20, m10 + m01, 1 - m00 + m11 - m22, m21 + m12],
-        [m10 - m01, m02 + m20, m21 + m12, 1 - m00 - m11 + m22],
-    ]
-    stacked = torch.stack([torch.stack(row, dim=-1) for row in candidates], dim=-2)  # [views, 4, 4]
-    best = torch.stack([candidates[i][i] for i in range(4)], dim=-1).argmax(-1)  # [views]
-    chosen = stacked.gather(-2, best[:, None, None].expand(-1, 1, 4))[:, 0]
-    return chosen / chosen.norm(dim=-1, keepdim=True)
-
-
-def harmonic_rotation(rotation: Tensor, coefficients: int) -> Tensor:
-    """Camera rotations [views, 3, 3] -> the matrix that takes harmonics as predicted to the world's 3DGS basis.
-
-    The releases rotate the bands with e3nn's Wigner matrices and evaluate them at (z, x, y). The rotation is kept as it
-    is, since the weights were trained with it, and then the basis is changed to the one every viewer reads.
-    Degree 2 and below. Returns [views, coefficients, coefficients].
-    """
-    blocks = [torch.ones_like(rotation[:, :1, :1])]
-    if coefficients > 1:
-        blocks.append(_to_3dgs(1, rotation) @ rotation)
-    if coefficients > 4:
-        blocks.append(_to_3dgs(2, rotation) @ _wigner2(rotation))
-    rows, start = [], 0
-    for block in blocks:
-        size = block.shape[-1]
-        rows.append(F.pad(block, (start, coefficients - start - size)))
-        start += size
-    return torch.cat(rows, dim=1)
-
-
-def _to_3dgs(band: int, like: Tensor) -> Tensor:
-    """One band from the releases' basis, evaluated at (z, x, y), to the 3DGS basis."""
-    half, root = 0.5, math.sqrt(3) / 2
-    matrices = {
-        1: [[0, -1, 0], [0, 0, -1], [1, 0, 0]],
-        2: [[0, -1, 0, 0, 0], [0, 0, 0, 1, 0], [0, 0, -half, 0, root], [-1, 0, 0, 0, 0], [0, 0, -root, 0, -half]],
-    }
-    return torch.tensor(matrices[band], dtype=like.dtype, device=like.device)
-
-
-def _wigner2(rotation: Tensor) -> Tensor:
-    """e3nn's Wigner matrix of degree 2 as a polynomial of the rotation, [views, 5, 5].
-
-    Each harmonic is a quadratic form v' B v with B symmetric and traceless; a rotation turns B into R' B R, whose
-    coordinates in the basis B are the matrix's row.
-    """
-    c, h = math.sqrt(3) / 2, 0.5
-    forms = [
-        [[0, 0, c], [0, 0, 0], [c, 0, 0]],  # sqrt(3) x z
-        [[0, c, 0], [c, 0, 0], [0, 0, 0]],  # sqrt(3) x y
-        [[-h, 0, 0], [0, 1, 0], [0, 0, -h]],  # y^2 - (x^2 + z^2) / 2
-        [[0, 0, 0], [0, 0, c], [0, c, 0]],  # sqrt(3) y z
-        [[-c, 0, 0], [0, 0, 0], [0, 0, c]],  # sqrt(3) / 2 (z^2 - x^2)
-    ]
-    basis = torch.tensor(forms, dtype=rotation.dtype, device=rotation.device)
-    turned = rotation.transpose(1, 2)[:, None] @ basis @ rotation[:, None]  # [views, 5, 3, 3]
-    squared_norm = basis[0].square().sum()  # the same for all five
-    return turned.flatten(2) @ basis.flatten(1).transpose(0, 1) / squared_norm

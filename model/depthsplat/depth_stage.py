@@ -6,13 +6,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ..common.cost_volume import CORNERS, cost_volume
-from ..common.encoder import PyramidFeatures
 from ..common.gather_attention import GatherAttention
 from ..common.geometry import Cameras
 from ..common.layers import Upsample2x, resize, softmax
 from ..common.unet import CostRegulariser
-from ..config import DepthSplatConfig
+from .config import DepthSplatConfig
+from .cost_volume import CORNERS, cost_volume
+from .encoder import PyramidFeatures
 from .upsampler import DepthUpsampler
 
 
@@ -31,6 +31,10 @@ class DepthOutput(NamedTuple):
 
     depth: Tensor  # [views, H, W], metric z-depth
     scale: DepthStageOutput
+
+    def named_outputs(self) -> dict[str, Tensor]:
+        """The network's output as exported graphs name it."""
+        return {"depth": self.depth}
 
 
 class DepthStage(nn.Module):

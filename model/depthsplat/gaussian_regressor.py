@@ -4,12 +4,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ..common.encoder import PyramidFeatures
 from ..common.gaussian_adapter import BASE_PARAMETERS, GaussianAdapter
 from ..common.geometry import Cameras
-from ..config import DepthSplatConfig
-from ..idesplat.gaussian_head import ModelOutput
+from ..common.outputs import ModelOutput
+from .config import DepthSplatConfig
 from .depth_stage import DepthStageOutput
+from .encoder import PyramidFeatures
 from .upsampler import Upsampler
 
 

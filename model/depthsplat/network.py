@@ -7,18 +7,21 @@ there by attention along epipolar lines, three times over (dpbu.py); and where i
 heads (upsampler.py, gaussian_regressor.py), there by window attention over shuffled pixels (gaussian_head.py).
 """
 
-from torch import Tensor, nn
+from torch import Tensor
 
-from ..common.encoder import PyramidEncoder, PyramidFeatures
 from ..common.geometry import Cameras
-from ..config import DepthSplatConfig
-from ..idesplat.gaussian_head import ModelOutput
+from ..common.network import Network
+from ..common.outputs import ModelOutput
+from .config import DepthSplatConfig
 from .depth_stage import CoarseDepth, DepthOutput, DepthStageOutput, FineDepth
+from .encoder import PyramidEncoder, PyramidFeatures
 from .gaussian_regressor import GaussianRegressor
 
 
-class DepthScales(nn.Module):
+class DepthScales(Network):
     """The stages up to the depth, with one scale or two."""
+
+    config: DepthSplatConfig
 
     def __init__(self, config: DepthSplatConfig) -> None:
         super().__init__()
@@ -53,16 +56,6 @@ class DepthSplat(DepthScales):
         super().__init__(config)
         self.gaussians = GaussianRegressor(config)
 
-    def forward(self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor, near: Tensor, far: Tensor) -> ModelOutput:
-        """Predict depth and Gaussians.
-
-        images: [views, 3, H, W], RGB in [0, 1]; H and W multiples of `config.size_multiple`, two views or more.
-        extrinsics: [views, 4, 4], camera-to-world, OpenCV axes.
-        intrinsics: [views, 3, 3], normalised by width and height.
-        near, far: [views], in scene units.
-        """
-        return self.stages(images, extrinsics, intrinsics, near, far)[-1]
-
     def stages(
         self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor, near: Tensor, far: Tensor
     ) -> tuple[PyramidFeatures, *tuple[DepthStageOutput, ...], ModelOutput]:
@@ -75,9 +68,7 @@ class DepthSplat(DepthScales):
 class DepthSplatDepth(DepthScales):
     """DepthSplat without Gaussians, as the depth-only checkpoints have it: the last scale's depth is the result."""
 
-    def forward(self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor, near: Tensor, far: Tensor) -> DepthOutput:
-        """Predict depth; arguments as for `DepthSplat`."""
-        return self.stages(images, extrinsics, intrinsics, near, far)[-1]
+    has_gaussians = False
 
     def stages(
         self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor, near: Tensor, far: Tensor

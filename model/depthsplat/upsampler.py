@@ -8,9 +8,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..common.dpt import DPT
-from ..common.encoder import MONO_STRIDE, PyramidFeatures
 from ..common.layers import resize
-from ..config import DepthSplatConfig
+from .config import DepthSplatConfig
+from .encoder import MONO_STRIDE, PyramidFeatures
 
 # Image size over that of the three maps of the pyramid that others join, finest first.
 STRIDES = (2, 4, 8)

@@ -4,7 +4,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..common.cost_volume import bordered, corners_around, interpolate
+from ..common.bilinear import bordered, corners_around, interpolate
 from ..common.geometry import Cameras, project_points, scale_intrinsics
 from ..common.layers import repeat_views, to_tokens
 

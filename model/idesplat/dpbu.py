@@ -8,10 +8,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..common.encoder import EncoderFeatures
 from ..common.geometry import Cameras, nearest_pixels, scale_intrinsics
 from ..common.layers import ConcatConv1x1, Upsample2x, resize, static_dim
-from ..config import DPBUConfig, IDESplatConfig
+from .config import DPBUConfig, IDESplatConfig
+from .encoder import EncoderFeatures
 from .epipolar_attention import EpipolarAttention
 
 

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from ..common.gather_attention import GatherAttention, pixel_table
 from ..common.layers import ConvFFN, repeat_views, static_dim, to_map, to_tokens
 from ..common.unet import CostRegulariser
-from ..config import DPBUConfig, IDESplatConfig
+from .config import DPBUConfig, IDESplatConfig
 
 # Keeps the renormalised product of probabilities away from zero.
 EPSILON = 1e-10

@@ -5,7 +5,7 @@ from torch import Tensor, nn
 
 from ..common.layers import ConvFFN, DepthwiseConv, to_map, to_tokens
 from ..common.windows import join_windows, region_mask, split_windows
-from ..config import FocusConfig
+from .config import FocusConfig
 
 EPSILON = 1e-10
 

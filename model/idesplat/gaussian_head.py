@@ -6,14 +6,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ..common.encoder import EncoderFeatures, normalise
-from ..common.gaussian_adapter import BASE_PARAMETERS, GaussianAdapter, WorldGaussians
+from ..common.encoder import normalise
+from ..common.gaussian_adapter import BASE_PARAMETERS, GaussianAdapter
 from ..common.geometry import Cameras
 from ..common.layers import resize
+from ..common.outputs import ModelOutput
 from ..common.unet import CostRegulariser
-from ..config import IDESplatConfig
+from .config import IDESplatConfig
 from .cross_view import CHANNELS, cross_view_features
 from .dpbu import DPBUOutput
+from .encoder import EncoderFeatures
 from .focused_attention import GaussianFocusedModule
 
 # Shares of the three units' and the residual head's inverse depth in the final one (mv_unimatch.py).
@@ -22,15 +24,6 @@ DEPTH_SHARES = (0.1, 0.1, 0.4, 0.4)
 SHUFFLE = 4
 # conv_image's channels are the feature channels over this.
 IMAGE_SHARE = 16
-
-
-class ModelOutput(NamedTuple):
-    """The network's result, and the two maps before it that parity looks at."""
-
-    depth: Tensor  # [views, H, W], metric z-depth
-    gaussians: WorldGaussians
-    features: Tensor  # [views, feature channels, H, W]
-    raw: Tensor  # [views, parameters, H, W]
 
 
 class HeadInputs(NamedTuple):

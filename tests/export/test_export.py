@@ -12,7 +12,8 @@ import torch
 from conftest import SMALL_PRESET, run_command, small_network
 from idesplat.export import cli
 from idesplat.export.stages import example_inputs
-from idesplat.export.validation.compare import Figures, TensorError
+from idesplat.export.validation.compare import TensorError
+from idesplat.model.family import ErrorQuantiles
 from idesplat.runtime.inference.metadata import INPUTS, OUTPUTS, read_manifest, read_metadata
 from idesplat.runtime.inference.predictor import Predictor
 
@@ -116,7 +117,9 @@ def test_fixed_views_and_size(small_checkpoint, presets, tmp_path, capsys):
 
 
 def test_a_departing_graph_leaves_no_file(small_checkpoint, presets, tmp_path, monkeypatch, capsys):
-    mismatch = TensorError("2 views", "encoder", "encoder.features_mv", Figures(1, 2, 3), Figures(1, 2, 2), 3.0)
+    mismatch = TensorError(
+        "2 views", "encoder", "encoder.features_mv", ErrorQuantiles(1, 2, 3), ErrorQuantiles(1, 2, 2), 3.0
+    )
     monkeypatch.setattr("idesplat.export.validation.compare.verify", lambda *_: iter([mismatch]))
     out, staged = tmp_path / "model.onnx", tmp_path / "staged"
     assert run_command(cli.main, small_checkpoint, out, "--staged", staged) == 1

@@ -15,8 +15,7 @@ from depthsplat_cases import ONE_SCALE, SMALL
 from idesplat.export.cli import main as export
 from idesplat.export.graph import external_data as weights
 from idesplat.export.stages import example_inputs
-from idesplat.model.config import PRESETS
-from idesplat.model.registry import build
+from idesplat.model.registry import PRESETS, build
 from idesplat.runtime.cli.infer import main as infer
 from idesplat.runtime.inference.metadata import INPUTS, read_manifest
 from idesplat.runtime.inference.predictor import Predictor

@@ -10,17 +10,16 @@ import pytest
 import torch
 from conftest import SMALL, small_network
 from idesplat.model.checkpoint import (
-    UNUSED,
     CheckpointError,
     file_sha256,
     fill,
     fitting_presets,
     infer_preset,
-    load_idesplat,
+    load_checkpoint,
     read_state_dict,
-    rename_key,
 )
-from idesplat.model.config import PRESETS
+from idesplat.model.idesplat.keys import RENAMING, rename_released
+from idesplat.model.registry import PRESETS
 from reference_weights import draw_state_dict
 from safetensors.torch import save_file
 
@@ -38,20 +37,20 @@ def test_containers(tmp_path, nest):
     tensors = small_network().state_dict()
     path = tmp_path / "weights.ckpt"
     torch.save(nest(tensors), path)
-    loaded = load_idesplat(path, SMALL).state_dict()
+    loaded = load_checkpoint(path, SMALL).state_dict()
     assert all(torch.equal(loaded[key], value) for key, value in tensors.items())
 
 
 def test_safetensors(tmp_path):
     path = tmp_path / "weights.safetensors"
     save_file(small_network().state_dict(), path)
-    assert load_idesplat(path, SMALL)
+    assert load_checkpoint(path, SMALL)
 
 
 def test_released_files_lose_their_prefix_and_what_belongs_to_the_loss(tmp_path):
     ours, loss = {"encoder.depth_predictor.conv_mv.bias": torch.zeros(2)}, {"losses.lpips.weight": torch.zeros(3)}
     torch.save({"state_dict": {**ours, **loss}}, tmp_path / "weights.ckpt")
-    assert list(read_state_dict(tmp_path / "weights.ckpt")) == ["depth_predictor.conv_mv.bias"]
+    assert list(rename_released(read_state_dict(tmp_path / "weights.ckpt"))) == ["dpbu1.merge.conv.bias"]
 
 
 def test_released_keys_cover_the_network(released):
@@ -69,8 +68,8 @@ def test_an_ambiguous_file_lists_the_presets_that_fit(released):
 
 
 def test_names_are_mapped_one_to_one(released):
-    used = [key for key in released if not UNUSED.search(key)]
-    assert len({rename_key(key) for key in used}) == len(used)
+    used = [key for key in released if not RENAMING.unused.search(key)]
+    assert len({RENAMING.rename_key(key) for key in used}) == len(used)
 
 
 def test_a_missing_an_unknown_and_a_misshapen_tensor_are_named():
@@ -176,7 +175,7 @@ def test_odd_contents_are_refused_in_one_line(tmp_path, name, legacy, recwarn):
     torch.save(make(), path, _use_new_zipfile_serialization=not legacy)
     recwarn.clear()
     with pytest.raises(CheckpointError) as error:
-        load_idesplat(path, SMALL)
+        load_checkpoint(path, SMALL)
     message = str(error.value)
     assert expected in message and "odd.pth" in message
     assert message.isprintable() and len(message) < 800
@@ -186,7 +185,7 @@ def test_odd_contents_are_refused_in_one_line(tmp_path, name, legacy, recwarn):
 def test_half_precision_is_taken(tmp_path):
     tensors = {key: value.half() for key, value in small_network().state_dict().items()}
     torch.save(tensors, tmp_path / "half.pth")
-    assert next(load_idesplat(tmp_path / "half.pth", SMALL).parameters()).dtype == torch.float32
+    assert next(load_checkpoint(tmp_path / "half.pth", SMALL).parameters()).dtype == torch.float32
 
 
 def test_a_tensor_with_attributes_of_its_own_is_used_as_a_tensor(tmp_path):
@@ -195,7 +194,7 @@ def test_a_tensor_with_attributes_of_its_own_is_used_as_a_tensor(tmp_path):
     weight = torch.nn.Parameter(tensors["dpbu1.merge.conv.bias"])
     weight.reshape = weight.isfinite = weight.squeeze = "text"
     torch.save({**tensors, "dpbu1.merge.conv.bias": weight}, tmp_path / "odd.pth")
-    assert load_idesplat(tmp_path / "odd.pth", SMALL)
+    assert load_checkpoint(tmp_path / "odd.pth", SMALL)
 
 
 @pytest.mark.parametrize("legacy", (False, True))

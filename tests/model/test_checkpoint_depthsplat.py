@@ -6,9 +6,8 @@ import json
 import pytest
 import torch
 from idesplat.model import checkpoint
-from idesplat.model.config import PRESETS
 from idesplat.model.depthsplat.network import DepthSplatDepth
-from idesplat.model.registry import build
+from idesplat.model.registry import PRESETS, build
 from reference_weights import FOLDER
 
 RELEASED = {

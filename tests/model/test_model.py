@@ -5,10 +5,12 @@ import torch
 from conftest import SMALL, small_network
 from idesplat.export.stages import example_inputs
 from idesplat.model.common import geometry
-from idesplat.model.common.gaussian_adapter import GaussianAdapter, quaternion_from_matrix
+from idesplat.model.common.gaussian_adapter import GaussianAdapter
 from idesplat.model.common.geometry import Cameras
-from idesplat.model.config import PRESETS, IDESplatConfig
+from idesplat.model.common.quaternions import quaternion_from_matrix
+from idesplat.model.idesplat.config import IDESplatConfig
 from idesplat.model.idesplat.network import IDESplat
+from idesplat.model.registry import PRESETS
 
 
 def count_parameters(model):

@@ -2,7 +2,8 @@
 
 from dataclasses import replace
 
-from idesplat.model.config import DepthScaleConfig, DepthSplatConfig, UNetConfig, UpsamplerConfig, ViTConfig
+from idesplat.model.config import UNetConfig, ViTConfig
+from idesplat.model.depthsplat.config import DepthScaleConfig, DepthSplatConfig, UpsamplerConfig
 
 VIT = ViTConfig(dim=48, depth=4, heads=2, out_indices=(0, 1, 2, 3))
 

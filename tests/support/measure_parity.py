@@ -15,10 +15,11 @@ from idesplat.export.precision.convert import PRECISIONS
 from idesplat.export.stages import NamedTensors
 from idesplat.export.tracing import StaticShape, export_graphs
 from idesplat.export.validation.cases import Case
-from idesplat.export.validation.compare import Exported, compare, tolerance_for
+from idesplat.export.validation.compare import Exported, compare
 from idesplat.model.checkpoint import fill
 from idesplat.model.common.gaussian_adapter import WorldGaussians
-from idesplat.model.registry import Network, build
+from idesplat.model.common.network import Network
+from idesplat.model.registry import build
 from idesplat.runtime.inference.metadata import INPUTS
 from idesplat.runtime.inference.session import SessionConfig, open_session, run_session
 from parity_cases import CASES as IDESPLAT_CASES
@@ -73,7 +74,7 @@ def variants(
             network, describe(model, "", "", "", StaticShape(), precision), StaticShape(), folder / precision
         )
         exported = Exported([(stage, graphs.of_stage(stage)) for stage in graphs.stages], staged=False)
-        rows = compare(exported, [between], tolerance_for(network, precision))
+        rows = compare(exported, [between], network.family.tolerances[precision])
         stages[precision] = max(row.errors.median for row in rows)
         session = open_session(graphs.whole, config=SessionConfig(THREADS))
         runs[precision] = lambda session=session: {

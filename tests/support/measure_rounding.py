@@ -7,8 +7,8 @@ from pathlib import Path
 
 import torch
 from idesplat.model.checkpoint import fill
-from idesplat.model.config import PRESETS
 from idesplat.model.idesplat.network import IDESplat
+from idesplat.model.registry import PRESETS
 from reference_weights import draw_state_dict, read_arrays
 
 CASE = "idesplat-re10k-2v-256x256"

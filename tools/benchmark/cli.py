@@ -314,7 +314,7 @@ def _row(entry: Entry, workload: "Workload") -> "Row":
 
 def _network_rows(rows: "Sequence[Row]", workload: "Workload", settings: Settings) -> "list[Row]":
     """A row for each of the models' networks, where PyTorch is to run them."""
-    from ...model.config import PRESETS
+    from ...model.registry import PRESETS
     from .report import Row
 
     presets = dict.fromkeys(row.preset for row in rows if row.preset in PRESETS)

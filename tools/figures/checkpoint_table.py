@@ -24,8 +24,8 @@ import torch
 import typer
 
 from ...export.cli import export
-from ...model.config import PRESETS, IDESplatConfig
-from ...model.registry import Network, build
+from ...model.common.network import Network
+from ...model.registry import PRESETS, build, family_of
 from ...runtime.cli.terminal import run, say
 from ...runtime.errors import InputError, exit_on_input_error
 from ...runtime.inference.normalization import SceneNormalization
@@ -110,7 +110,7 @@ def row(preset: str, found: Measured) -> str:
     fewest, most = config.trained_views
     cells = (
         f"`{RELEASED[preset]}`",
-        "IDESplat" if isinstance(config, IDESplatConfig) else "DepthSplat",
+        family_of(config).name,
         f"`{preset}`",
         f"{found.parameters / 1e6:.1f} M",
         f"{config.height}x{config.width}",

@@ -22,7 +22,7 @@ from ...runtime.errors import InputError, exit_on_input_error
 from .schedule import Objective, Part, PerceptualKind, Phase, Precision, lr_factor, phase_at, training_phases
 
 if TYPE_CHECKING:  # torch and compiled code are loaded only once there is something to train
-    from ...model.config import IDESplatConfig
+    from ...model.idesplat.config import IDESplatConfig
     from ...model.idesplat.network import IDESplat
     from .log import TrainingLog
     from .losses import Perceptual
@@ -298,7 +298,8 @@ class Bar:
 
 def _config(settings: Settings) -> "IDESplatConfig":
     """The preset's configuration; raises InputError if there is none, or the size does not fit it."""
-    from ...model.config import PRESETS, IDESplatConfig
+    from ...model.idesplat.config import IDESplatConfig
+    from ...model.registry import PRESETS
 
     presets = {name: config for name, config in PRESETS.items() if isinstance(config, IDESplatConfig)}
     if settings.preset not in presets:

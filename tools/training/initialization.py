@@ -11,11 +11,11 @@ from importlib import import_module
 import torch
 from torch import Tensor, nn
 
-from ...model.common.efficientnet import EfficientNetLite0, fold_batch_norms
 from ...model.common.gaussian_adapter import SCALE_SHIFT
 from ...model.common.mv_transformer import TransformerBlock, WindowAttention
 from ...model.common.unet import CostRegulariser, ResBlock
-from ...model.config import IDESplatConfig
+from ...model.idesplat.config import IDESplatConfig
+from ...model.idesplat.efficientnet import EfficientNetLite0, fold_batch_norms
 from ...model.idesplat.epipolar_attention import EpipolarAttention
 from ...model.idesplat.network import IDESplat
 from ...runtime.errors import InputError

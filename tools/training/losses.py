@@ -7,11 +7,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ...model.common.encoder import EncoderFeatures
 from ...model.common.gaussian_adapter import BASE_SIZES
 from ...model.common.layers import repeat_views
-from ...model.config import IDESplatConfig
+from ...model.idesplat.config import IDESplatConfig
 from ...model.idesplat.dpbu import DPBUOutput
+from ...model.idesplat.encoder import EncoderFeatures
 
 # Shares of the terms of one stage's loss.
 FIRST_LAYER_WEIGHT = 0.5

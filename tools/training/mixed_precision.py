@@ -16,10 +16,10 @@ from ...model.common.dinov2 import DinoV2
 from ...model.common.dpt import DPTHead
 from ...model.common.layers import ConcatConv1x1, ConvFFN, Upsample2x
 from ...model.common.mv_transformer import MultiViewTransformer
-from ...model.common.photographic_branch import PhotoBranch
 from ...model.common.unet import CostRegulariser
 from ...model.idesplat.focused_attention import GaussianFocusedModule
 from ...model.idesplat.network import IDESplat
+from ...model.idesplat.photographic_branch import PhotoBranch
 
 LOWERED = (
     *(Backbone, MultiViewTransformer, DinoV2, PhotoBranch, CostRegulariser),

@@ -3,7 +3,7 @@
 import torch.nn.functional as F
 from torch import Tensor
 
-from ...model.common.efficientnet import EfficientNetLite0
+from ...model.idesplat.efficientnet import EfficientNetLite0
 from .initialization import load_photographic_weights
 
 # Of the network's maps, those at strides 2, 4 and 8.

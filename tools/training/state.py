@@ -9,7 +9,7 @@ from torch import nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from ...model.checkpoint import CheckpointError, fill, read_state_dict
-from ...model.config import IDESplatConfig
+from ...model.idesplat.config import IDESplatConfig
 from ...model.idesplat.network import IDESplat
 from ...runtime.errors import InputError
 from ...runtime.system.files import atomic_write, check_regular

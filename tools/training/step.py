@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
-from ...model.common.encoder import EncoderFeatures
 from ...model.common.geometry import invert_rigid, scale_intrinsics
 from ...model.common.layers import resize
 from ...model.idesplat.dpbu import Cameras, DPBUOutput
+from ...model.idesplat.encoder import EncoderFeatures
 from ...model.idesplat.network import IDESplat
 from .losses import (
     Perceptual,

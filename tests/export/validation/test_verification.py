@@ -12,12 +12,15 @@ from idesplat.export.room import room_inputs
 from idesplat.export.stages import NamedTensors, Stage
 from idesplat.export.tracing import StaticShape
 from idesplat.export.validation.cases import Case, verification_cases
-from idesplat.export.validation.compare import FUSED, NEAREST, STAGED, Exported, Figures, TensorError, compare
+from idesplat.export.validation.compare import FUSED, STAGED, Exported, TensorError, compare, error_quantiles
 from idesplat.export.validation.report import print_details, print_summary
+from idesplat.model.family import ErrorQuantiles
+from idesplat.model.idesplat.family import IDESPLAT
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.inference.metadata import INPUTS, read_manifest, read_metadata
 from onnx import helper, numpy_helper
 
+TOLERANCE = IDESPLAT.tolerances["float32"]
 FAR_END = np.iinfo(np.int64).max
 
 
@@ -195,7 +198,7 @@ def test_a_fault_in_a_fused_export_is_caught(exported, cases, fault, tmp_path):
     path = shutil.copy(exported[0], tmp_path / "model.onnx")
     fault(path)
     stage, tensor = FAULTS[fault]
-    failed = [error for error in compare(Exported([], staged=False, fused=path), cases, NEAREST) if not error.passed]
+    failed = [error for error in compare(Exported([], staged=False, fused=path), cases, TOLERANCE) if not error.passed]
     assert {error.stage for error in failed} == {FUSED}
     assert (tensor if stage == "gaussians" else "depth") in {error.tensor for error in failed}
 
@@ -205,7 +208,7 @@ def test_a_fault_in_a_staged_export_is_caught_in_its_stage_and_end_to_end(export
     stage, tensor = FAULTS[fault]
     folder = shutil.copytree(exported[1], tmp_path / "staged")
     fault(folder / f"{stage}.onnx")
-    failed = [error for error in compare(Exported(stages_of(folder)), cases, NEAREST) if not error.passed]
+    failed = [error for error in compare(Exported(stages_of(folder)), cases, TOLERANCE) if not error.passed]
     assert {error.stage for error in failed} == {stage, STAGED}
     assert tensor in {error.tensor for error in failed}
 
@@ -214,22 +217,20 @@ def test_a_stage_that_is_right_by_itself_is_caught_if_it_is_not_given_what_it_re
     """Stages in the wrong order, or one too few, fail in a row even if each alone does not."""
     stages = stages_of(exported[1])
     with pytest.raises(InputError, match="dpbu2"):
-        list(compare(Exported([*stages[:2], *stages[3:]]), cases[1:2], NEAREST))
+        list(compare(Exported([*stages[:2], *stages[3:]]), cases[1:2], TOLERANCE))
 
 
 def test_a_sound_export_passes_by_far(exported, cases):
-    errors = list(compare(Exported(stages_of(exported[1]), True, exported[0]), cases, NEAREST))
+    errors = list(compare(Exported(stages_of(exported[1]), True, exported[0]), cases, TOLERANCE))
     assert {error.stage for error in errors} == {stage.name for stage, _ in stages_of(exported[1])} | {FUSED, STAGED}
-    assert max(max(error.shares) for error in errors) < 0.5
+    assert max(max(error.ratios) for error in errors) < 0.5
 
 
 # ---- the figures
 
 
-def figures(found, expected, views=2, name="depth"):
-    from idesplat.export.validation.compare import _figures
-
-    return _figures(name, np.asarray(found), np.asarray(expected), views)[0]
+def figures(found, expected, views=2):
+    return error_quantiles(np.asarray(found), np.asarray(expected), views)[0]
 
 
 @pytest.fixture
@@ -277,9 +278,9 @@ def test_a_channel_that_is_constant_up_to_rounding_is_measured_by_its_tensor():
 def test_nan_shapes_and_indices(depth):
     nan = depth.copy()
     nan[1, 5, 5] = np.nan
-    bounds = Figures(1.0, 1.0, 1.0)
+    bounds = ErrorQuantiles(1.0, 1.0, 1.0)
     error = TensorError("case", "stage", "depth", figures(nan, depth, 4), bounds, np.nan)
-    assert not error.passed and max(error.shares) == np.inf
+    assert not error.passed and max(error.ratios) == np.inf
     assert figures(depth.transpose(0, 2, 1), depth, 4) == (np.inf,) * 3
     assert figures([[1, 2], [0, 1]], [[1, 2], [0, 2]], 2, "encoder.neighbours") == (np.inf,) * 3
     assert figures([[1, 2], [0, 2]], [[1, 2], [0, 2]], 2, "encoder.neighbours") == (0,) * 3
@@ -289,9 +290,25 @@ def test_nan_shapes_and_indices(depth):
 
 
 ERRORS = [
-    TensorError("room, 2 views", "encoder", "encoder.mv", Figures(1e-6, 1e-6, 1e-6), Figures(1e-4, 1e-3, 1e-2), 9.0),
-    TensorError("noise, 5 views", "encoder", "encoder.cnn", Figures(1e-6, 2e-3, 1e-6), Figures(1e-4, 1e-3, 1e-2), 9.0),
-    TensorError("room, 2 views", FUSED, "depth", Figures(1e-6, 1e-6, 5e-3), Figures(1e-4, 1e-3, 1e-2), 9.0),
+    TensorError(
+        "room, 2 views",
+        "encoder",
+        "encoder.mv",
+        ErrorQuantiles(1e-6, 1e-6, 1e-6),
+        ErrorQuantiles(1e-4, 1e-3, 1e-2),
+        9.0,
+    ),
+    TensorError(
+        "noise, 5 views",
+        "encoder",
+        "encoder.cnn",
+        ErrorQuantiles(1e-6, 2e-3, 1e-6),
+        ErrorQuantiles(1e-4, 1e-3, 1e-2),
+        9.0,
+    ),
+    TensorError(
+        "room, 2 views", FUSED, "depth", ErrorQuantiles(1e-6, 1e-6, 5e-3), ErrorQuantiles(1e-4, 1e-3, 1e-2), 9.0
+    ),
 ]
 
 
@@ -319,7 +336,7 @@ def test_the_whole_table_has_every_figure_beside_its_bound(capsys):
 def prepared(small_checkpoint, presets, tmp_path_factory):
     """The small network's graphs as `export_graphs` leaves them; tracing takes most of an export."""
     from idesplat.export.tracing import export_graphs
-    from idesplat.model.config import PRESETS
+    from idesplat.model.registry import PRESETS
 
     folder = tmp_path_factory.mktemp("graphs")
     model = small_network()

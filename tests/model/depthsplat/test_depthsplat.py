@@ -1,10 +1,11 @@
 """DepthSplat beyond two views: against the release at other numbers of views and strides, and as a small network.
 
-`data/depthsplat-views` was computed by the release (commit 2dad25a) with a ViT of four blocks and the weights drawn
-below, keyed by this project's names; it keeps every third pixel of depth and matching features, every twelfth of the
-upsampled features.
+`data/depthsplat-views` was computed by the release (commit 2dad25a) with a ViT of four blocks and random weights, each
+drawn from a seed and the name that the parameter had then (`former_name`). It keeps every third pixel of depth and
+matching features, every twelfth of the upsampled features.
 """
 
+import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,17 +17,21 @@ from depthsplat_cases import ONE_SCALE, SMALL
 from idesplat.export.cli import describe
 from idesplat.export.stages import NamedTensors
 from idesplat.export.tracing import StaticShape, export_graphs
-from idesplat.model.common.cost_volume import by_gathering, by_sampling
 from idesplat.model.common.gather_attention import GatherAttention
 from idesplat.model.common.geometry import Cameras, project_candidates, sampling_points, scale_intrinsics
 from idesplat.model.common.layers import resize
-from idesplat.model.config import PRESETS
-from idesplat.model.registry import build
+from idesplat.model.depthsplat.cost_volume import by_gathering, by_sampling
+from idesplat.model.registry import PRESETS, build
 from idesplat.runtime.inference.metadata import INPUTS
 from idesplat.runtime.inference.session import open_session, run_session
 from reference_weights import draw_tensor
 
 VIEWS = sorted((Path(__file__).parent.parent.parent / "data" / "depthsplat-views").glob("*.npz"))
+
+
+def former_name(key):
+    """The name of a parameter when the reference data was computed."""
+    return re.sub(r"\.upsample(_|\d\.)", r".grow\1", key).replace(".downsample.", ".shrink2.")
 
 
 @pytest.fixture(scope="module", params=VIEWS, ids=lambda path: path.stem)
@@ -39,8 +44,8 @@ def views(request):
     model = build(replace(config, vit=replace(config.vit, depth=4, out_indices=(0, 1, 2, 3)))).eval()
     seed, gain = expected["seed"].item(), expected["gain"].item()
     shapes = {name: tuple(value.shape) for name, value in model.state_dict().items()}
-    drawn = {name: draw_tensor(name, shape, seed, gain).astype(np.float32) for name, shape in shapes.items()}
-    model.load_state_dict({name: torch.from_numpy(value) for name, value in drawn.items()})
+    drawn = {name: draw_tensor(former_name(name), shape, seed, gain) for name, shape in shapes.items()}
+    model.load_state_dict({name: torch.from_numpy(value.astype(np.float32)) for name, value in drawn.items()})
     images = resize(expected["thumbnails"] / 255, *map(int, size.split("x")))
     cameras = [expected[name] for name in INPUTS[1:]]
     with torch.no_grad():

@@ -15,9 +15,10 @@ import torch
 from idesplat.model.checkpoint import fill
 from idesplat.model.common.gaussian_adapter import GaussianAdapter, WorldGaussians
 from idesplat.model.common.layers import resize
-from idesplat.model.config import PRESETS, IDESplatConfig
+from idesplat.model.idesplat.config import IDESplatConfig
 from idesplat.model.idesplat.dpbu import Cameras
 from idesplat.model.idesplat.network import IDESplat
+from idesplat.model.registry import PRESETS
 from parity_cases import CASES, as_reference, share_within
 from reference_weights import draw_state_dict, read_arrays, read_meta
 

@@ -4,8 +4,7 @@ import re
 
 import torch
 from conftest import run_command
-from idesplat.model.config import PRESETS
-from idesplat.model.registry import build
+from idesplat.model.registry import PRESETS, build
 from idesplat.tools.figures.checkpoint_table import COLUMNS, RELEASED, Measured, main, randomize_weights, row
 
 

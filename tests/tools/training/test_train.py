@@ -15,9 +15,11 @@ from types import SimpleNamespace
 import cv2
 import pytest
 import torch
-from idesplat.model.checkpoint import load_idesplat
-from idesplat.model.config import PRESETS, DPBUConfig, DPTConfig, FocusConfig, IDESplatConfig, UNetConfig, ViTConfig
+from idesplat.model.checkpoint import load_checkpoint
+from idesplat.model.config import DPTConfig, UNetConfig, ViTConfig
+from idesplat.model.idesplat.config import DPBUConfig, FocusConfig, IDESplatConfig
 from idesplat.model.idesplat.network import IDESplat
+from idesplat.model.registry import PRESETS
 from idesplat.runtime.cameras.camera import Camera
 from idesplat.runtime.errors import EXIT_STATUS, InputError
 from idesplat.runtime.views.batch import ViewBatch, build_view_batch
@@ -257,7 +259,7 @@ def test_resumed_run_equals_uninterrupted(finished: Path, tmp_path: Path, monkey
 
 def test_checkpoint_is_one_for_the_exporter(finished: Path) -> None:
     """The exporter's strict loader reads it, and finds the running mean."""
-    model = load_idesplat(finished / CHECKPOINT, SMALL)
+    model = load_checkpoint(finished / CHECKPOINT, SMALL)
     content = torch.load(finished / CHECKPOINT, weights_only=True)
     weights = content["training"]["weights"]
     found = model.state_dict()
@@ -305,7 +307,7 @@ def test_killed_process_leaves_a_checkpoint_to_go_on_from(tmp_path: Path) -> Non
     finally:
         process.send_signal(signal.SIGKILL)
         process.wait()
-    model = load_idesplat(tmp_path / CHECKPOINT, PRESETS["idesplat-tiny"])
+    model = load_checkpoint(tmp_path / CHECKPOINT, PRESETS["idesplat-tiny"])
     assert all(value.isfinite().all() for value in model.state_dict().values())
     training = torch.load(tmp_path / CHECKPOINT, weights_only=True)["training"]
     assert 1 <= training["step"] <= len(logged(tmp_path))
@@ -417,6 +419,6 @@ def test_folder_without_a_photograph_is_refused(scene: Path, tmp_path: Path) -> 
 def test_init_takes_weights_and_starts_from_step_zero(finished: Path) -> None:
     state = TrainingState(SMALL, seed=1, lr=1e-3, vit_lr=1e-3)
     state.start_from(finished / CHECKPOINT)
-    expected = load_idesplat(finished / CHECKPOINT, SMALL).state_dict()
+    expected = load_checkpoint(finished / CHECKPOINT, SMALL).state_dict()
     assert state.step == 0
     assert all(torch.equal(value, expected[name]) for name, value in state.model.state_dict().items())

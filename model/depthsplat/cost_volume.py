@@ -5,15 +5,14 @@ GridSample, slow on CPUs and missing elsewhere. Interpolation and inner product 
 first and interpolates between four scores.
 """
 
-from collections.abc import Sequence
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from .gather_attention import GatherAttention
-from .geometry import Cameras, sampling_points, scale_intrinsics
-from .layers import repeat_views, static_dim, to_tokens
+from ..common.bilinear import bordered, corners_around, interpolate
+from ..common.gather_attention import GatherAttention
+from ..common.geometry import Cameras, sampling_points, scale_intrinsics
+from ..common.layers import repeat_views, static_dim, to_tokens
 
 CORNERS = 4  # pixels around a point
 
@@ -59,24 +58,3 @@ def by_gathering(
     rows = torch.cat([first + corner for corner in corners], dim=1)  # [pairs, 4 * candidates, h * w]
     scores = gather_attention.gathered_dot(own, table.flatten(0, 1), rows)
     return interpolate(scores.split(static_dim(x.shape[1]), dim=1), across, down)
-
-
-def bordered(features: Tensor) -> Tensor:
-    """Maps [n, channels, h, w] with a border of zeros, which is what lies outside."""
-    return F.pad(features, (1, 1, 1, 1))
-
-
-def corners_around(x: Tensor, y: Tensor, height: int, width: int) -> tuple[list[Tensor], Tensor, Tensor]:
-    """The four pixels around x and y as indices of a bordered map, upper ones first, and the way from left and top."""
-    left, top = x.floor().clamp(max=width - 1), y.floor().clamp(max=height - 1)
-    row = width + 2
-    upper_left = ((top + 1) * row + left + 1).to(torch.int32)
-    return [upper_left, upper_left + 1, upper_left + row, upper_left + row + 1], x - left, y - top
-
-
-def interpolate(around: Sequence[Tensor], across: Tensor, down: Tensor) -> Tensor:
-    """Bilinear interpolation between what `corners_around` orders."""
-    upper_left, upper_right, lower_left, lower_right = around
-    upper = upper_left + across * (upper_right - upper_left)
-    lower = lower_left + across * (lower_right - lower_left)
-    return upper + down * (lower - upper)

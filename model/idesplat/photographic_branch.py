@@ -3,8 +3,8 @@
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ..config import PhotoConfig
-from .dpt import TINY, Fusion
+from ..common.dpt import TINY, Fusion
+from .config import PhotoConfig
 from .efficientnet import CHANNELS, EfficientNetLite0
 
 # Of the network's maps, the pyramid has those at strides 4, 8 and 16.

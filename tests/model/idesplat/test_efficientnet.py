@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from idesplat.model.common.efficientnet import CHANNELS, STRIDES, EfficientNetLite0
-from idesplat.model.config import PRESETS, IDESplatConfig
+from idesplat.model.idesplat.config import IDESplatConfig
+from idesplat.model.idesplat.efficientnet import CHANNELS, STRIDES, EfficientNetLite0
 from idesplat.model.idesplat.network import IDESplat
+from idesplat.model.registry import PRESETS
 from idesplat.runtime.errors import InputError
 from idesplat.tools.training import initialization as initialisation
 from idesplat.tools.training.initialization import load_photographic_weights, new_model
