@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from .runtime.splats.formats.ply import read_ply, write_ply
     from .runtime.splats.gaussians import Gaussians
     from .runtime.splats.io import read_offset, read_splats, write_splats
+    from .tools.evaluation.evaluate import evaluate
 
     __version__: str
 
@@ -35,6 +36,7 @@ _MODULE_OF = {
     "Predictor": "runtime.inference.predictor",
     "bundled_model": "runtime.inference.bundled_model",
     "estimate_cameras": "runtime.sfm.estimate",
+    "evaluate": "tools.evaluation.evaluate",
     "rasterize": "runtime.rendering.rasterizer",
     "read_cameras": "runtime.cameras.io",
     "read_offset": "runtime.splats.io",
@@ -57,6 +59,7 @@ __all__ = [
     "__version__",
     "bundled_model",
     "estimate_cameras",
+    "evaluate",
     "rasterize",
     "read_cameras",
     "read_offset",

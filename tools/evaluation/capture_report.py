@@ -1,19 +1,20 @@
-"""What an evaluation on captures leaves: tables on the terminal, and results.json."""
+"""Reports of an evaluation on captures: tables on the terminal, and results.json."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from rich.table import Table
 
 from ...runtime.cli.terminal import say
-from ...runtime.system.files import atomic_write
 from .capture_scores import PAIRS, CaptureScores, mean_of_captures
 from .captures import PAIR
 from .novel_views import MODEL, NEAREST, ORACLE_PLANE, Scores
-from .report import RESULTS, print_table
+from .report import describe, print_table, write_json
+
+if TYPE_CHECKING:
+    from .evaluate import CaptureEvaluation
 
 # Heading, method and measure of a column of means.
 COLUMNS = (
@@ -50,13 +51,14 @@ def print_captures(results: Sequence[CaptureScores], counts: Sequence[int], size
     print_table(table)
 
 
-def write_capture_results(
-    folder: Path, about: dict[str, Any], results: Sequence[CaptureScores], counts: Sequence[int]
-) -> Path:
+def write_capture_results(folder: Path, result: "CaptureEvaluation") -> Path:
     """Write `results.json`: what was evaluated, the means by number of views, every capture; returns its path."""
+    counts, results = result.view_counts, result.captures
     present = [count for count in counts if any(count in result.cases for result in results)]
     content = {
-        **about,
+        "command": "captures",
+        "views": counts,
+        **describe(result),
         "mean": {str(count): mean_of_captures(results, count) for count in present},
         "captures": [
             {
@@ -68,10 +70,7 @@ def write_capture_results(
             for result in results
         ],
     }
-    path = folder / RESULTS
-    with atomic_write(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=1) + "\n")
-    return path
+    return write_json(folder, content)
 
 
 def _cells(means: Scores) -> list[str]:

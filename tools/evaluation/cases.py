@@ -60,7 +60,7 @@ class EvalCase:
     covisible: np.ndarray | None = None
 
 
-def procedural_case(
+def synthetic_case(
     seed: int, context: int, pool: int, targets: int, height: int, width: int, closer: int = 1
 ) -> EvalCase:
     """The procedural scene of `seed`, with exact depth; the same arguments give the same case.

@@ -32,7 +32,7 @@ NPY_HEADER_BYTES, MOST_BYTES_A_DEPTH = 1 << 16, 16
 LEAST_VALID = 0.1  # of a image's pixels
 
 
-def chosen_frames(
+def split_frames(
     frames: Sequence[Frame], context: Sequence[str], targets: Sequence[str], views: int, hold_out_every: int
 ) -> list[tuple[list[int], list[int]]]:
     """Which frames a network is given and which it is to meet: pairs of context and targets, as numbers of frames.

@@ -1,18 +1,19 @@
-"""How far a image or a depth map is from the truth: PSNR, SSIM, LPIPS, AbsRel, as the field counts them."""
+"""Image and depth metrics: PSNR, SSIM, LPIPS, AbsRel, delta < 1.25 and the inlier ratio at 1.05."""
 
-import sys
 from collections.abc import Callable
 from importlib.util import find_spec
 
 import numpy as np
 
-# SSIM of Wang et al., as scikit-image computes it with Gaussian weights and the releases report it.
-SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
-SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
-# Images that agree exactly count as this good, in dB.
+from ...runtime.errors import InputError
+
+# SSIM as Wang et al. (2004) define it and the releases compute it with scikit-image.
+SSIM_WINDOW = 11
+# PSNR of images that agree exactly, in dB.
 HIGHEST_PSNR = 100.0
 # Thresholds of max(D / D*, D* / D): of delta < 1.25, and of the inlier ratio.
 DELTA, INLIER = 1.25, 1.05
+INSTALL = "pip install 'idesplat[eval]'"
 
 LPIPS = Callable[[np.ndarray, np.ndarray, np.ndarray], float]
 
@@ -41,54 +42,53 @@ def fit_exposure(image: np.ndarray, truth: np.ndarray, valid: np.ndarray) -> np.
 
 
 def ssim(image: np.ndarray, truth: np.ndarray, valid: np.ndarray) -> float:
-    """Structural similarity: its mean over colours and over the pixels whose whole window lies on valid pixels.
+    """Structural similarity (scikit-image, Gaussian weights of sigma 1.5, window 11), averaged over colour channels.
 
-    image, truth: [height, width, 3], 0 to 1, not clipped. valid: bool [height, width]; all valid gives the number
-    of scikit-image (Gaussian weights, sigma 1.5, window 11). NaN if no window is valid throughout.
+    image, truth: [height, width, 3], 0 to 1, not clipped. valid: bool [height, width]. Only pixels whose whole window
+    is valid count; NaN if there is none.
     """
     import cv2
+    from skimage.metrics import structural_similarity
 
-    def local_mean(values: np.ndarray) -> np.ndarray:
-        return cv2.GaussianBlur(values, (SSIM_WINDOW, SSIM_WINDOW), SSIM_SIGMA)
-
-    x, y = image.astype(np.float64), truth.astype(np.float64)
-    mean_x, mean_y = local_mean(x), local_mean(y)
-    unbiased = SSIM_WINDOW**2 / (SSIM_WINDOW**2 - 1)
-    variance_x = unbiased * (local_mean(x * x) - mean_x**2)
-    variance_y = unbiased * (local_mean(y * y) - mean_y**2)
-    covariance = unbiased * (local_mean(x * y) - mean_x * mean_y)
-    similarity = (2 * mean_x * mean_y + SSIM_C1) * (2 * covariance + SSIM_C2)
-    similarity /= (mean_x**2 + mean_y**2 + SSIM_C1) * (variance_x + variance_y + SSIM_C2)
-
-    padded = np.pad(valid, 1).astype(np.uint8)  # outside of the image nothing is valid
+    _, similarity = structural_similarity(
+        truth.astype(np.float64),
+        image.astype(np.float64),
+        win_size=SSIM_WINDOW,
+        gaussian_weights=True,
+        data_range=1.0,
+        channel_axis=2,
+        full=True,
+    )
+    padded = np.pad(valid, 1).astype(np.uint8)  # pixels outside the image are not valid
     window = np.ones((SSIM_WINDOW, SSIM_WINDOW), np.uint8)
     whole = cv2.erode(padded, window, borderType=cv2.BORDER_REPLICATE)[1:-1, 1:-1].astype(bool)
     return float(similarity[whole].mean()) if whole.any() else float("nan")
 
 
-def load_lpips() -> LPIPS | None:
-    """LPIPS with VGG16 as a function of image, truth and valid, like the others; None and a warning if not there.
+def check_ssim() -> None:
+    """Raise InputError if scikit-image, which computes SSIM, is not installed."""
+    if find_spec("skimage") is None:
+        raise InputError(f"scikit-image is needed for SSIM, and is not installed; {INSTALL}")
 
-    It needs the packages torch and lpips, and VGG16's weights where torchvision keeps them; nothing is downloaded.
-    Pixels that are not valid are given the truth's colour.
+
+def load_lpips() -> LPIPS:
+    """LPIPS with VGG16 (Zhang et al. 2018) as a function of image, truth and valid, like the other metrics.
+
+    Invalid pixels are given the truth's colour. Raises InputError if torch, lpips or VGG16's weights are missing.
     """
-    for package in ("torch", "lpips"):
-        if find_spec(package) is None:
-            print(f"warning: LPIPS is left out, since the package {package} is not installed", file=sys.stderr)
-            return None
-    import torch
+    try:
+        import torch
 
-    from ..training.losses import load_perceptual
-
-    network = load_perceptual()
-    if network is None:
-        return None
+        from ..training.losses import load_lpips_network
+    except ImportError as error:
+        raise InputError(f"LPIPS is left out, since the package {error.name} is not installed") from None
+    network = load_lpips_network()
 
     def distance(image: np.ndarray, truth: np.ndarray, valid: np.ndarray) -> float:
         shown = np.where(valid[..., None], image, truth)
         first, second = (torch.from_numpy(x.astype(np.float32)).permute(2, 0, 1)[None] for x in (shown, truth))
         with torch.no_grad():
-            return float(network(first, second))
+            return float(network(first, second, normalize=True).mean())
 
     return distance
 

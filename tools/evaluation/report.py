@@ -1,10 +1,10 @@
-"""What an evaluation leaves: tables on the terminal, and results.json."""
+"""Reports of an evaluation: tables on the terminal, and results.json."""
 
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.table import Table
@@ -12,6 +12,9 @@ from rich.table import Table
 from ...runtime.cli.terminal import literal, say
 from ...runtime.system.files import atomic_write
 from .novel_views import MODEL, NEAREST, ORACLE_DEPTH, ORACLE_PLANE, Result, Scores
+
+if TYPE_CHECKING:
+    from .evaluate import CaptureEvaluation, Evaluation
 
 RESULTS = "results.json"
 TITLES = {
@@ -26,7 +29,7 @@ TITLES = {
 DECIMALS = {"psnr": 2, "psnr_covisible": 2}
 USUAL_DECIMALS = 3
 METHODS = {MODEL: "model", NEAREST: "nearest", ORACLE_PLANE: "oracle plane", ORACLE_DEPTH: "oracle depth"}
-WIDTH = 120  # columns, where there is no terminal to ask
+WIDTH = 130  # columns, where there is no terminal to ask
 
 
 def print_views(results: Sequence[Result]) -> None:
@@ -64,9 +67,28 @@ def print_means(means: Scores, title: str) -> None:
     print_table(table)
 
 
-def write_results(folder: Path, about: dict[str, Any], means: Scores, results: Sequence[Result]) -> Path:
+def write_results(folder: Path, options: dict[str, Any], result: "Evaluation") -> Path:
     """Write `results.json`: what was evaluated, the means, every scene and every target; returns its path."""
-    content = {**about, "mean": means, "scenes": [asdict(result) for result in results]}
+    return write_json(
+        folder,
+        {
+            **options,
+            **describe(result),
+            "skipped": result.skipped,
+            "missing": result.missing,
+            "mean": result.mean,
+            "scenes": [asdict(scene) for scene in result.scenes],
+        },
+    )
+
+
+def describe(result: "Evaluation | CaptureEvaluation") -> dict[str, Any]:
+    """The fields of `results.json` that say what was evaluated."""
+    return {"size": result.size, "model": {"path": str(result.model), **asdict(result.metadata)}}
+
+
+def write_json(folder: Path, content: dict[str, Any]) -> Path:
+    """Write `results.json` in a folder; returns its path."""
     path = folder / RESULTS
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(content, indent=1) + "\n")

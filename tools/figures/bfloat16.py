@@ -19,7 +19,7 @@ from ...runtime.errors import exit_on_input_error
 from ...runtime.inference.bundled_model import bundled_model
 from ...runtime.inference.model_files import read_model
 from ...runtime.inference.session import open_session, run_session
-from ..evaluation.cases import procedural_case
+from ..evaluation.cases import synthetic_case
 from ..synthetic.sampler import HELD_OUT_SEEDS
 
 MATMULS = ("MatMul", "Conv", "ConvTranspose")
@@ -34,7 +34,7 @@ def main(
     """Round the operands of one part after the other, and compare depth with that of the model as it is."""
     path = model or bundled_model()
     own = read_model(path).metadata
-    cases = [procedural_case(seed, VIEWS, VIEWS, 1, own.height, own.width) for seed in HELD_OUT_SEEDS[:scenes]]
+    cases = [synthetic_case(seed, VIEWS, VIEWS, 1, own.height, own.width) for seed in HELD_OUT_SEEDS[:scenes]]
     feeds = [
         {
             "images": case.context.images,

@@ -21,7 +21,7 @@ from ...runtime.inference.bundled_model import bundled_model
 from ...runtime.inference.predictor import Predictor
 from ...runtime.splats.gaussians import Gaussians
 from ..evaluation.baselines import SPLAT_PIXELS, oracle_depth_splats
-from ..evaluation.cases import EvalCase, procedural_case
+from ..evaluation.cases import EvalCase, synthetic_case
 from ..evaluation.metrics import psnr
 from ..evaluation.novel_views import render_target
 from ..synthetic.sampler import HELD_OUT_SEEDS
@@ -51,7 +51,7 @@ def main(
 def _measured(predictor: Predictor, seed: int, closer: int) -> list[list[float]]:
     """For each target of a scene its PSNR, dB, by size of the splats, and last by the model's own."""
     own = predictor.metadata
-    case = procedural_case(seed, VIEWS, VIEWS, TARGETS, own.height, own.width, closer)
+    case = synthetic_case(seed, VIEWS, VIEWS, TARGETS, own.height, own.width, closer)
     given = case.context
     predicted = predictor.predict_arrays(given.images, given.extrinsics, given.intrinsics, case.near, case.far)
     assert case.depth is not None

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,7 +12,7 @@ from ...model.common.gaussian_adapter import BASE_SIZES
 from ...model.common.layers import repeat_views
 from ...model.idesplat.config import IDESplatConfig
 from ...model.idesplat.dpbu import DPBUOutput
-from ...model.idesplat.encoder import EncoderFeatures
+from ...runtime.errors import InputError
 
 # Shares of the terms of one stage's loss.
 FIRST_LAYER_WEIGHT = 0.5
@@ -31,7 +32,7 @@ LARGE_SQUARED = 0.003
 OFFSET_WEIGHT = 0.05
 # The share of LPIPS beside the squared error (the papers' lambda).
 LPIPS_WEIGHT = 0.05
-# The file that torchvision keeps VGG16's weights in, on which LPIPS rests.
+# The file in torchvision's cache folder with the VGG16 weights that LPIPS is built on.
 VGG_WEIGHTS = "vgg16-397923af.pth"
 TINY = 1e-6
 # The offsets' channels among a pixel's raw parameters.
@@ -140,13 +141,23 @@ def offset_loss(raw: Tensor) -> Tensor:
 def load_perceptual() -> Perceptual | None:
     """LPIPS if the `lpips` package and VGG16's weights are on this machine, else None and a warning; no download."""
     try:
+        network = load_lpips_network()
+    except InputError as error:
+        print(f"warning: {error}", file=sys.stderr)
+        return None
+    return lambda rendered, truth: network(rendered, truth, normalize=True).mean()
+
+
+def load_lpips_network() -> Any:
+    """LPIPS with VGG16 (Zhang et al. 2018) as the package lpips has it, with frozen weights; nothing is downloaded.
+
+    Raises InputError if the package or VGG16's weights in torchvision's cache folder are missing.
+    """
+    try:
         import lpips
     except ImportError:
-        print("warning: LPIPS is left out, since the package lpips is not installed", file=sys.stderr)
-        return None
+        raise InputError("LPIPS is left out, since the package lpips is not installed") from None
     weights = Path(torch.hub.get_dir()) / "checkpoints" / VGG_WEIGHTS
     if not weights.is_file():
-        print(f"warning: LPIPS is left out, since VGG16's weights are not at {weights}", file=sys.stderr)
-        return None
-    network = lpips.LPIPS(net="vgg", verbose=False).requires_grad_(False)
-    return lambda rendered, truth: network(rendered, truth, normalize=True).mean()
+        raise InputError(f"LPIPS is left out, since VGG16's weights are not at {weights}")
+    return lpips.LPIPS(net="vgg", verbose=False).requires_grad_(False)

@@ -16,7 +16,7 @@ from idesplat.tools.evaluation.baselines import (
     oracle_depth_splats,
     warp_plane,
 )
-from idesplat.tools.evaluation.cases import PosedImages, find_covisible, procedural_case
+from idesplat.tools.evaluation.cases import PosedImages, find_covisible, synthetic_case
 from idesplat.tools.evaluation.image_folders import load_case
 from idesplat.tools.evaluation.metrics import psnr
 from idesplat.tools.evaluation.novel_views import render_target
@@ -155,7 +155,7 @@ def test_splats_seen_closer_want_to_be_larger() -> None:
     """At the true depth 0.3 pixels beat 0.45 as large as the images, and leave gaps four times as large."""
     better = {}
     for closer in (1, 4):
-        case = procedural_case(HELD_OUT_SEEDS[1], 2, 2, 1, 128, 128, closer)
+        case = synthetic_case(HELD_OUT_SEEDS[1], 2, 2, 1, 128, 128, closer)
         rule = oracle_depth_splats(case.depth, case.context)
         small, large = (replace(rule, scales=rule.scales * np.float32(pixels / SPLAT_PIXELS)) for pixels in (0.3, 0.45))
         truth, seen = case.targets.image(0), case.covisible[0]

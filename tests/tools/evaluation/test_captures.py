@@ -14,8 +14,8 @@ from conftest import run_command
 from idesplat import Predictor, read_cameras
 from idesplat.runtime.cameras.camera import Camera
 from idesplat.runtime.errors import InputError
-from idesplat.runtime.inference import predictor as predictor_module
 from idesplat.tools.evaluation import captures, checkouts
+from idesplat.tools.evaluation import evaluate as library
 from idesplat.tools.evaluation.captures import CaptureImages, parse_view_counts, read_captures
 from idesplat.tools.evaluation.checkouts import extract, fetch_checkout, find_checkout, list_folder
 from idesplat.tools.evaluation.choose_captures import as_json, camera_entries
@@ -195,7 +195,7 @@ def measured(
 ) -> tuple[dict[str, Any], Predictor]:
     """The command's results for triples and three views, with the predictor that it used."""
     opened = Predictor(exported[0])
-    monkeypatch.setattr(predictor_module, "Predictor", lambda path: opened)
+    monkeypatch.setattr(library, "Predictor", lambda path: opened)
     monkeypatch.chdir(capture_file.parent)
     checkouts_folder = repository[0].parents[1]
     options = ("--checkouts", checkouts_folder, "--model", exported[0], "--out", "out", "--views", "3, 2,4")

@@ -15,11 +15,11 @@ from idesplat import Gaussians, Predictor, rasterize, read_cameras
 from idesplat.runtime.cli.outputs import Outputs
 from idesplat.runtime.images.io import find_images, load_image
 from idesplat.runtime.images.resizing import resize_and_crop
-from idesplat.runtime.inference import predictor as predictor_module
 from idesplat.runtime.system.files import atomic_write
 from idesplat.runtime.views.batch import match_images_to_cameras
-from idesplat.tools.evaluation import cli as evaluate
-from idesplat.tools.evaluation.cases import procedural_case
+from idesplat.tools.evaluation import defaults
+from idesplat.tools.evaluation import evaluate as library
+from idesplat.tools.evaluation.cases import synthetic_case
 from idesplat.tools.evaluation.chunks import IndexEntry, chunk_cases
 from idesplat.tools.evaluation.cli import main
 from idesplat.tools.evaluation.image_folders import load_case
@@ -44,9 +44,7 @@ def workplace(scene: Path, exported: tuple[Path, Path], opened: Predictor, tmp_p
     index = {"x": None, "b": {"context": [0, 4], "target": [1, 2, 3]}, "gone": {"context": [0, 1], "target": [2]}}
     (tmp_path / "index.json").write_text(json.dumps(index))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(
-        predictor_module, "Predictor", lambda path: opened if path == Path("model.onnx") else Predictor(path)
-    )
+    monkeypatch.setattr(library, "Predictor", lambda path: opened if path == Path("model.onnx") else Predictor(path))
     return tmp_path
 
 
@@ -161,12 +159,12 @@ def test_chunks_go_on_after_a_damaged_scene(workplace: Path, scene: Path, capsys
 
 
 def test_procedural_scenes_have_true_depth(workplace: Path, opened: Predictor, capsys: Capture) -> None:
-    assert len(HELD_OUT_SEEDS) == evaluate.HELD_OUT_SCENES
+    assert len(HELD_OUT_SEEDS) == defaults.HELD_OUT_SCENES
     assert run_command(main, *PROCEDURAL, "--views", "3") == 0
     content = results()
     (only,) = content["scenes"]
     assert only["name"] == str(HELD_OUT_SEEDS[0]) and len(only["context"]) == 3
-    sample = generate_sample(HELD_OUT_SEEDS[0], 3, evaluate.TARGETS, 64, 96)
+    sample = generate_sample(HELD_OUT_SEEDS[0], 3, defaults.SYNTHETIC_TARGETS, 64, 96)
     prediction = opened.predict_arrays(
         sample.images[:3], sample.extrinsics[:3], sample.intrinsics[:3], sample.near, sample.far
     )
@@ -182,16 +180,15 @@ def test_procedural_scenes_have_true_depth(workplace: Path, opened: Predictor, c
 def test_fewer_views_of_the_same_scene() -> None:
     """The targets stay, and of four views the first and the last are left."""
     seed, shape = HELD_OUT_SEEDS[0], (32, 48)
-    all_four, two = (procedural_case(seed, count, 4, 1, *shape) for count in (4, 2))
+    all_four, two = (synthetic_case(seed, count, 4, 1, *shape) for count in (4, 2))
     np.testing.assert_array_equal(two.targets.images, all_four.targets.images)
     np.testing.assert_array_equal(two.context.extrinsics, all_four.context.extrinsics[[0, 3]])
     np.testing.assert_array_equal(two.depth, all_four.depth[[0, 3]])
 
 
 def test_lpips_takes_its_place_beside_the_others(workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from idesplat.tools.evaluation import metrics
 
-    monkeypatch.setattr(metrics, "load_lpips", lambda: lambda image, truth, valid: 0.25)
+    monkeypatch.setattr(library, "load_lpips", lambda: lambda image, truth, valid: 0.25)
     assert run_command(main, *SCENE, *NAMED) == 0
     assert {method: scores["lpips"] for method, scores in results()["mean"].items()} == {
         "model": 0.25,
@@ -261,6 +258,6 @@ def test_bad_input_is_one_line_and_leaves_nothing(name: str, workplace: Path, ca
 
 
 def test_procedural_scenes_need_numba(workplace: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
-    monkeypatch.setattr(evaluate, "find_spec", lambda package: None)
+    monkeypatch.setattr(library, "find_spec", lambda package: None)
     assert run_command(main, *PROCEDURAL) == 2
     assert "numba is needed" in capsys.readouterr().err

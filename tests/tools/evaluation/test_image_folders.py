@@ -14,7 +14,7 @@ from idesplat.runtime.errors import InputError
 from idesplat.runtime.images.io import find_images
 from idesplat.runtime.views.batch import ViewBatch, build_view_batch, match_images_to_cameras
 from idesplat.runtime.views.depth_range import DepthRange
-from idesplat.tools.evaluation.image_folders import Frame, chosen_frames, context_for, load_case
+from idesplat.tools.evaluation.image_folders import Frame, context_for, load_case, split_frames
 from idesplat.tools.synthetic.sampler import look_at
 
 SIZE = HEIGHT, WIDTH = 64, 96  # of images 96 x 128: scaled to 72 x 96, four rows cut above and below
@@ -41,17 +41,17 @@ def on_a_line(count: int) -> list[Frame]:
 
 def test_named_frames() -> None:
     frames = on_a_line(9)
-    assert chosen_frames(frames, ["0006", "0008.jpg"], ["0007"], 2, 8) == [([6, 8], [7])]
-    assert chosen_frames(frames, ["0008", "0000", "0006"], ["0007", "0001"], 2, 8) == [([8, 0, 6], [7, 1])]
+    assert split_frames(frames, ["0006", "0008.jpg"], ["0007"], 2, 8) == [([6, 8], [7])]
+    assert split_frames(frames, ["0008", "0000", "0006"], ["0007", "0001"], 2, 8) == [([8, 0, 6], [7, 1])]
 
 
 def test_frames_held_out_by_number() -> None:
     """As in LLFF's split: frames 0, 8, 16 and on."""
     frames = on_a_line(20)
-    assert chosen_frames(frames, [], [], 2, 8) == [([1, 2], [0]), ([7, 9], [8]), ([15, 17], [16])]
-    assert chosen_frames(frames, [], [], 2, 2)[:2] == [([1, 3], [0, 2]), ([3, 5], [4])]
-    assert chosen_frames(on_a_line(5), [], [], 2, 8) == [([1, 2], [0])]
-    assert chosen_frames(frames, [], ["0004", "0005"], 2, 8) == [([3, 6], [4, 5])]  # the held out are no context
+    assert split_frames(frames, [], [], 2, 8) == [([1, 2], [0]), ([7, 9], [8]), ([15, 17], [16])]
+    assert split_frames(frames, [], [], 2, 2)[:2] == [([1, 3], [0, 2]), ([3, 5], [4])]
+    assert split_frames(on_a_line(5), [], [], 2, 8) == [([1, 2], [0])]
+    assert split_frames(frames, [], ["0004", "0005"], 2, 8) == [([3, 6], [4, 5])]  # the held out are no context
 
 
 def test_context_lies_around_the_target() -> None:
@@ -81,7 +81,7 @@ def test_context_lies_around_the_target() -> None:
 )
 def test_refuses(context: list[str], targets: list[str], views: int, expected: str) -> None:
     with pytest.raises(InputError, match=expected):
-        chosen_frames(on_a_line(9), context, targets, views, 8)
+        split_frames(on_a_line(9), context, targets, views, 8)
 
 
 def test_pictures_as_the_runtime_prepares_them(scene: Path) -> None:
