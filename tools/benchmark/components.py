@@ -22,7 +22,7 @@ from rich.table import Table
 
 from ...runtime.cli.terminal import run
 from ...runtime.inference.session import usable_cores
-from .cli import SETTLE_SECONDS, thread_environment
+from .runner import SETTLE_SECONDS, thread_environment
 from .worker import Prepared, Worker
 
 if TYPE_CHECKING:

@@ -19,8 +19,8 @@ from torch import Tensor, nn
 from ...export.graph.gather_loops import FEW, chunked, lower_custom_ops
 from ...model.common.gather_attention import GatherAttention
 from ...runtime.cli.terminal import run
-from .cli import thread_environment
 from .components import run_interleaved
+from .runner import thread_environment
 from .worker import Prepared
 
 PAIRS = 2

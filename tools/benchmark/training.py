@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ...runtime.errors import InputError
 from ...runtime.system.files import scratch_folder
 
 if TYPE_CHECKING:
@@ -67,10 +68,13 @@ def bench_training(rounds: int, steps: int) -> None:
 
 
 def _measure(phase: str, candidate: Candidate, steps: int) -> dict[str, Any]:
-    """One candidate in a process of its own, which has others of its own."""
+    """Measure one candidate in a process of its own, which starts others; raises InputError if that fails."""
     command = [sys.executable, "-P", "-m", __name__, phase, json.dumps(list(vars(candidate).values())), str(steps)]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, check=True, capture_output=True, text=True, env=environment)
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    if done.returncode != 0:
+        reason = (done.stderr.strip().splitlines() or ["without a message; memory may have run out"])[-1]
+        raise InputError(f"{candidate.name}: its process ended with {done.returncode} ({reason})")
     return json.loads(done.stdout.splitlines()[-1])
 
 

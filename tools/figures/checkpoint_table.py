@@ -30,7 +30,7 @@ from ...runtime.cli.terminal import run, say
 from ...runtime.errors import InputError, exit_on_input_error
 from ...runtime.inference.normalization import SceneNormalization
 from ...runtime.inference.session import CPU
-from ..benchmark.cli import thread_environment
+from ..benchmark.runner import thread_environment
 from ..benchmark.worker import Failed, Prepared, Worker, Workload, example_arrays, exported
 
 # Released files by the preset that they fit; the asterisk stands for what we have not seen of a name.

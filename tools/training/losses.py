@@ -12,6 +12,7 @@ from ...model.common.gaussian_adapter import BASE_SIZES
 from ...model.common.layers import repeat_views
 from ...model.idesplat.config import IDESplatConfig
 from ...model.idesplat.dpbu import DPBUOutput
+from ...model.idesplat.encoder import EncoderFeatures
 from ...runtime.errors import InputError
 
 # Shares of the terms of one stage's loss.

@@ -10,8 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import SMALL, SMALL_PRESET, run_command
+from idesplat.runtime.errors import InputError
 from idesplat.runtime.inference.session import CPU, SessionConfig, open_session
 from idesplat.tools.benchmark import cli as bench
+from idesplat.tools.benchmark import runner, training
 from idesplat.tools.benchmark.report import Row, compare, read_rows, write_rows
 from idesplat.tools.benchmark.worker import (
     Failed,
@@ -216,12 +218,12 @@ def test_the_command_compares(exported, measured, tmp_path, capsys):
 
 
 def test_what_is_done_when_it_is_interrupted_is_kept(exported, tmp_path, monkeypatch, capsys):
-    def one_and_stop(entries, workload, settings, say):
+    def one_and_stop(candidates, workload, settings, on_status):
         if workload.views == 4:
             raise KeyboardInterrupt
         return [a_row(views=workload.views)]
 
-    monkeypatch.setattr(bench, "measure", one_and_stop)
+    monkeypatch.setattr(runner, "measure", one_and_stop)
     path = tmp_path / "part.json"
     arguments = (exported[0], *USUAL, "--views", "2,3,4,6", "--json", path)
     assert run_command(bench.main, *arguments) == bench.INTERRUPTED
@@ -270,10 +272,17 @@ def test_a_json_of_an_older_layout_is_named_in_one_line(tmp_path, capsys):
     assert printed.count("\n") == 1
 
 
+def test_a_failing_training_benchmark_is_one_line():
+    candidate = training.Candidate("no-such-preset", "float32", 1, 1)
+    with pytest.raises(InputError, match=r"no-such-preset.*: its process ended with 1 \(.*no-such-preset") as error:
+        training._measure("128x128, first DPBU", candidate, 1)
+    assert "\n" not in str(error.value)
+
+
 def test_environment_is_left_as_it_was(monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
-    with bench.thread_environment(3):
+    with runner.thread_environment(3):
         assert (os.environ["OMP_NUM_THREADS"], os.environ["MKL_NUM_THREADS"]) == ("3", "3")
     assert os.environ["OMP_NUM_THREADS"] == "7"
     assert "MKL_NUM_THREADS" not in os.environ
