@@ -25,8 +25,8 @@ from idesplat.runtime.errors import printable
 from idesplat.runtime.inference.metadata import StageFile, write_manifest
 from idesplat.runtime.system.files import SCRATCH_PREFIX
 from idesplat.tools.benchmark import cli as bench
-from idesplat.tools.evaluation import checkouts
 from idesplat.tools.evaluation import cli as evaluate
+from idesplat.tools.evaluation.captures import checkouts
 from idesplat.tools.training import cli as train
 from mutations import TEXTS, make_odd_paths, mutated, mutated_json, tried
 from scene_files import as_scene, pinholes, snapshot, write_scene

@@ -35,8 +35,8 @@ from idesplat.runtime.system.output_records import add_to_record, read_record
 from idesplat.runtime.views.depth_range import DepthRange
 from idesplat.runtime.views.world_offset import parse_offset
 from idesplat.tools.benchmark.report import Row, read_rows
-from idesplat.tools.evaluation import captures
-from idesplat.tools.evaluation.captures import parse_view_counts, read_captures
+from idesplat.tools.evaluation.captures import capture as captures
+from idesplat.tools.evaluation.captures.capture import parse_view_counts, read_captures
 from idesplat.tools.evaluation.chunks import chunk_cases, read_chunk, read_index
 from idesplat.tools.evaluation.image_folders import load_case
 from idesplat.tools.training.log import TrainingLog

@@ -482,7 +482,7 @@ def test_readers_take_regular_files_alone(tmp_path, kind):
             "from idesplat.runtime.images.header import image_size\n"
             "from idesplat.runtime.images.io import load_image\n"
             "from idesplat.runtime.images.video_reader import extract_sharp_frames\n"
-            "from idesplat.tools.evaluation.captures import read_captures\n"
+            "from idesplat.tools.evaluation.captures.capture import read_captures\n"
             "from idesplat.tools.training.log import TrainingLog\n"
             f"splats, cameras = {SPLATS!r}, {CAMERAS!r}\n"
             "forms = [CameraFormat.TRANSFORMS, CameraFormat.OWN, CameraFormat.RE10K, CameraFormat.OPENCV,\n"

@@ -170,8 +170,8 @@ def captures(
 ) -> None:
     """Evaluate on real captures at pinned commits of public repositories, cloned where they are not given (git)."""
     from ...runtime.images.png import save_png
-    from .capture_report import print_captures, write_capture_results
-    from .captures import parse_view_counts
+    from .captures.capture import parse_view_counts
+    from .captures.report import print_captures, write_capture_results
     from .evaluate import evaluate_captures
 
     counts = parse_view_counts(views)

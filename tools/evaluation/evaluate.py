@@ -23,10 +23,10 @@ from ...runtime.inference.predictor import Predictor
 from ...runtime.system.files import scratch_folder
 from ...runtime.system.progress import progress
 from ...runtime.views.batch import match_images_to_cameras
-from .capture_scores import CaptureEvaluator, CaptureScores, Show
-from .captures import CaptureImages, read_captures
+from .captures.capture import CaptureImages, read_captures
+from .captures.checkouts import clones_folder, extract, fetch_checkout
+from .captures.scores import CaptureEvaluator, CaptureScores, Show
 from .cases import EvalCase, synthetic_case
-from .checkouts import clones_folder, extract, fetch_checkout
 from .chunks import NEAR_PLANE_FACTOR, chunk_cases, find_chunks, read_index
 from .defaults import CONTEXT_VIEWS, HELD_OUT_SCENES, HOLD_OUT_EVERY, SYNTHETIC_TARGETS, VIEW_COUNTS
 from .image_folders import load_case, split_frames

@@ -14,11 +14,12 @@ from conftest import run_command
 from idesplat import Predictor, read_cameras
 from idesplat.runtime.cameras.camera import Camera
 from idesplat.runtime.errors import InputError
-from idesplat.tools.evaluation import captures, checkouts
 from idesplat.tools.evaluation import evaluate as library
-from idesplat.tools.evaluation.captures import CaptureImages, parse_view_counts, read_captures
-from idesplat.tools.evaluation.checkouts import extract, fetch_checkout, find_checkout, list_folder
-from idesplat.tools.evaluation.choose_captures import as_json, camera_entries
+from idesplat.tools.evaluation.captures import capture as captures
+from idesplat.tools.evaluation.captures import checkouts
+from idesplat.tools.evaluation.captures.capture import CaptureImages, parse_view_counts, read_captures
+from idesplat.tools.evaluation.captures.checkouts import extract, fetch_checkout, find_checkout, list_folder
+from idesplat.tools.evaluation.captures.choose import as_json, camera_entries
 from idesplat.tools.evaluation.cli import main
 from idesplat.tools.evaluation.metrics import HIGHEST_PSNR, fit_exposure, psnr
 from idesplat.tools.evaluation.novel_views import render_target

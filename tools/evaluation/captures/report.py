@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
-from ...runtime.cli.terminal import say
-from .capture_scores import PAIRS, CaptureScores, mean_of_captures
-from .captures import PAIR
-from .novel_views import MODEL, NEAREST, ORACLE_PLANE, Scores
-from .report import describe, print_table, write_json
+from ....runtime.cli.terminal import say
+from ..novel_views import MODEL, NEAREST, ORACLE_PLANE, Scores
+from ..report import describe, print_table, write_json
+from .capture import PAIR
+from .scores import PAIRS, CaptureScores, mean_of_captures
 
 if TYPE_CHECKING:
-    from .evaluate import CaptureEvaluation
+    from ..evaluate import CaptureEvaluation
 
 # Heading, method and measure of a column of means.
 COLUMNS = (

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from ...runtime.inference.predictor import Predictor
-from ...runtime.splats.gaussians import Gaussians
-from .baselines import best_fronto_parallel_plane, nearest_view
-from .captures import PAIR, Capture, CaptureImages
-from .cases import EvalCase
-from .metrics import LPIPS, fit_exposure, psnr, ssim
-from .novel_views import MODEL, NEAREST, ORACLE_PLANE, Scores, comparison_strip, render_target
+from ....runtime.inference.predictor import Predictor
+from ....runtime.splats.gaussians import Gaussians
+from ..baselines import best_fronto_parallel_plane, nearest_view
+from ..cases import EvalCase
+from ..metrics import LPIPS, fit_exposure, psnr, ssim
+from ..novel_views import MODEL, NEAREST, ORACLE_PLANE, Scores, comparison_strip, render_target
+from .capture import PAIR, Capture, CaptureImages
 
 PAIRS = "pairs"  # the model's result from the two views around each held-out frame
 

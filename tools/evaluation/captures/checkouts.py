@@ -5,8 +5,8 @@ import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
-from ...runtime.errors import InputError
-from ...runtime.system.files import make_folder, scratch_folder
+from ....runtime.errors import InputError
+from ....runtime.system.files import make_folder, scratch_folder
 
 CLONES = "captures"  # in our own cache folder
 HOST = "https://github.com"

@@ -1,4 +1,4 @@
-"""The validation captures: which images of which public repositories, and their cameras.
+"""The validation captures: frames of public repositories, with their cameras.
 
 `captures.json` holds one object for each capture:
 
@@ -18,29 +18,29 @@ range that the camera is known to see, or null. Pixel centres are at .5. Of a tr
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ...runtime.cameras.camera import Camera
-from ...runtime.cameras.parsing import entries, read_json
-from ...runtime.errors import InputError, error_context
-from ...runtime.geometry.intrinsics import intrinsic_matrix
-from ...runtime.geometry.quaternions import quaternions_to_matrices
-from ...runtime.images.io import load_image
-from ...runtime.system.limits import parse_whole_number
-from ...runtime.views.batch import ViewBatch
-from ...runtime.views.depth_range import DepthRange
-from ...runtime.views.loader import load_view
-from .cases import EvalCase, PosedImages
-from .image_folders import valid_pixels
+from ....runtime.cameras.camera import Camera
+from ....runtime.cameras.parsing import entries, read_json
+from ....runtime.errors import InputError, error_context
+from ....runtime.geometry.intrinsics import intrinsic_matrix
+from ....runtime.geometry.quaternions import quaternions_to_matrices
+from ....runtime.images.io import load_image
+from ....runtime.system.limits import parse_whole_number
+from ....runtime.views.batch import ViewBatch
+from ....runtime.views.depth_range import DepthRange
+from ....runtime.views.loader import load_view
+from ..cases import EvalCase, PosedImages
+from ..image_folders import valid_pixels
 
 CAPTURES_FILE = Path(__file__).with_name("captures.json")
 FORMAT, VERSION = "idesplat-captures", 1
 PAIR = 2  # context views of a triple
-MOST_VIEWS = 24  # of a path
+MAX_VIEWS = 24  # of a path
 
 FindRange = Callable[[ViewBatch], DepthRange]
 
@@ -53,9 +53,9 @@ class Triple:
     target: str
 
 
-@dataclass(frozen=True, eq=False)
-class Capture:
-    """One capture of the file, as the module describes it; cameras by frame name."""
+@dataclass(frozen=True)
+class CaptureSource:
+    """Where a capture comes from: the images in a folder of a public repository at a pinned commit."""
 
     name: str
     kind: str
@@ -64,6 +64,12 @@ class Capture:
     repository: str
     commit: str
     folder: str
+
+
+@dataclass(frozen=True, eq=False)
+class Capture(CaptureSource):
+    """One capture of the file, as the module describes it; cameras by frame name."""
+
     cameras: dict[str, Camera]
     triples: list[Triple]
     views: list[str]
@@ -166,13 +172,13 @@ def read_captures(names: Sequence[str] = (), path: Path | None = None) -> list[C
 def parse_view_counts(text: str) -> list[int]:
     """The option --views, such as `2,6`: numbers of context views, in rising order; raises InputError."""
     counts = [parse_whole_number(word.strip()) or 0 for word in text.split(",")]
-    if not all(PAIR <= count <= MOST_VIEWS for count in counts):
-        raise InputError(f"--views {text}: expected numbers from {PAIR} to {MOST_VIEWS} with commas, such as 2,6")
+    if not all(PAIR <= count <= MAX_VIEWS for count in counts):
+        raise InputError(f"--views {text}: expected numbers from {PAIR} to {MAX_VIEWS} with commas, such as 2,6")
     return sorted(set(counts))
 
 
 def _capture(entry: dict[str, Any]) -> Capture:
-    texts = ("name", "kind", "content", "licence", "repository", "commit", "folder")
+    texts = [field.name for field in fields(CaptureSource)]
     with error_context(str(entry.get("name"))):
         try:
             cameras = {frame[0]: _camera(entry["lenses"], frame) for frame in entry["frames"]}

@@ -1,0 +1,1 @@
+"""Evaluation on real captures: images at pinned commits of public repositories."""

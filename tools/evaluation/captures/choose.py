@@ -1,0 +1,168 @@
+"""Choose the frames of the validation captures and write `captures.json`.
+
+    python -P -m idesplat.tools.evaluation.captures.choose --checkouts DIR --work DIR
+
+For each capture: cameras from the repository, or estimated from the images; SIFT matches between neighbouring frames
+give the scene's depth and the epipolar distance, and frames whose cameras do not fit are left out. A triple is two
+frames whose baseline is about a quarter of the depth and a third one between them; triples in a row make a path of
+views. No model is run.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from ....runtime.cameras.camera import Camera
+from ....runtime.cameras.io import read_cameras, write_cameras
+from ....runtime.cli.terminal import run, say
+from ....runtime.errors import InputError, exit_on_input_error
+from ....runtime.geometry.quaternions import matrices_to_quaternions
+from ....runtime.images.io import SUFFIXES
+from ....runtime.sfm.estimate import estimate_cameras
+from ....runtime.system.files import atomic_write, make_folder
+from ....runtime.views.batch import match_images_to_cameras
+from .capture import CAPTURES_FILE, FORMAT, VERSION, CaptureSource
+from .checkouts import extract, fetch_checkout, list_folder
+from .paths import TRIPLES, longest_path, spread_triples, triple_costs
+from .recipes import ESTIMATED, RECIPES, Recipe
+from .survey import cached_survey
+
+# Least overlap of what two of three frames see, and largest baseline: the first that give triples, or a path of views.
+OVERLAP_AND_BASELINE = ((0.6, 0.4), (0.5, 0.5), (0.35, 0.8))
+MIN_VIEWS = 6  # of a path, where the last limits leave so many
+MAX_EPIPOLAR_PX = 1.0  # pixels, median over a frame's matches with a neighbour
+DECIMALS = 9
+
+
+@exit_on_input_error
+def choose_captures(
+    checkouts: Annotated[Path, typer.Option(help="Folder of checkouts; missing ones are cloned into it.")],
+    work: Annotated[Path, typer.Option(help="Folder for images and estimated cameras, which are reused.")],
+    capture: Annotated[list[str] | None, typer.Option(help="Choose for this capture alone; may be repeated.")] = None,
+) -> None:
+    """Choose frames and write the package's captures.json; captures that are not named stay as they are."""
+    before = json.loads(CAPTURES_FILE.read_text())["captures"] if CAPTURES_FILE.exists() else []
+    entries = {entry["name"]: entry for entry in before}
+    order = [recipe.name for recipe in RECIPES]
+    for recipe in RECIPES:
+        if not capture or recipe.name in capture:
+            entries[recipe.name] = _choose(recipe, checkouts, work)
+            with atomic_write(CAPTURES_FILE) as temporary:
+                temporary.write_text(as_json([entries[name] for name in order if name in entries]))
+    say(f"wrote {CAPTURES_FILE}: {len(entries)} captures")
+
+
+def _choose(recipe: Recipe, checkouts: Path, work: Path) -> dict[str, Any]:
+    """The entry of `captures.json` for a recipe; raises InputError if its frames give too few triples."""
+    images, cameras = _frames(recipe, checkouts, make_folder(work / recipe.name))
+    pairs = match_images_to_cameras(images, cameras)
+    pairs = [(path, replace(camera, name=path.name)) for path, camera in pairs]
+    survey = cached_survey(work / recipe.name / "survey.npz", pairs)
+    good = np.flatnonzero(survey.error < MAX_EPIPOLAR_PX)
+    positions = np.stack([camera.extrinsics[:3, 3] for _, camera in pairs])
+    triples: list[tuple[int, int, int]] = []
+    views: list[int] = []
+    between: list[int] = []
+    for limits in OVERLAP_AND_BASELINE:
+        cost = triple_costs(positions, survey, good, *limits)
+        if len(triples) < TRIPLES:
+            triples = spread_triples(cost, positions, survey)
+        if len(views) < MIN_VIEWS:
+            views, between = longest_path(cost, positions, survey)
+    if len(triples) < TRIPLES:
+        raise InputError(f"{recipe.name}: {len(triples)} triples found, expected {TRIPLES}; leave the capture out")
+    names = [path.name for path, _ in pairs]
+    used = sorted({*np.ravel(triples).tolist(), *views, *between})
+    baselines = [float(survey.baseline[a, b]) for a, b, _ in triples]
+    say(
+        f"{recipe.name}: {len(good)} of {len(pairs)} frames fit, epipolar {np.median(survey.error[used]):.2f} px, "
+        f"baseline/depth {np.median(baselines):.2f}, path of {len(views)} views, "
+        f"{np.median([survey.baseline[a, b] for a, b in pairwise(views)] or [0]):.2f} apart"
+    )
+    return {
+        **{field.name: getattr(recipe, field.name) for field in fields(CaptureSource)},
+        "cameras": recipe.cameras,
+        "epipolar_px": round(float(np.median(survey.error[used])), 2),
+        **camera_entries([pairs[index][1] for index in used]),
+        "triples": [[names[index] for index in triple] for triple in triples],
+        "views": [names[index] for index in views],
+        "between": [names[index] for index in between],
+    }
+
+
+def _frames(recipe: Recipe, checkouts: Path, work: Path) -> tuple[list[Path], list[Camera]]:
+    """The recipe's images, written into the work folder, and their cameras."""
+    checkout = fetch_checkout(checkouts, recipe.repository, recipe.commit)
+    found = [
+        name for name in list_folder(checkout, recipe.commit, recipe.folder) if Path(name).suffix.lower() in SUFFIXES
+    ]
+    names = sorted(found, key=lambda name: (len(name), name))[recipe.first : recipe.last : recipe.step]
+    missing = [name for name in names if not (work / name).exists()]
+    extract(checkout, recipe.commit, recipe.folder, missing, work)
+    images = [work / name for name in names]
+    if recipe.cameras != ESTIMATED:
+        parent, _, name = recipe.cameras.rpartition("/")
+        source = make_folder(work / "cameras") / name
+        if not source.exists():
+            inside = list_folder(checkout, recipe.commit, recipe.cameras)
+            if inside:
+                extract(checkout, recipe.commit, recipe.cameras, inside, source)
+            else:
+                extract(checkout, recipe.commit, parent, [name], source.parent)
+        known = read_cameras(source, images)
+    else:
+        estimated = work / "estimated.json"
+        if not estimated.exists():
+            found_cameras = estimate_cameras(images, recipe.focal)
+            write_cameras(estimated, [replace(camera, name=Path(camera.name).name) for camera in found_cameras])
+        known = read_cameras(estimated)
+    stems = {Path(camera.name).stem for camera in known}
+    return [image for image in images if image.stem in stems], known
+
+
+def camera_entries(cameras: Sequence[Camera]) -> dict[str, Any]:
+    """The fields `lenses` and `frames` of a capture."""
+    lenses: list[dict[str, Any]] = []
+    frames = []
+    for camera in cameras:
+        K = [round(float(value), 4) for value in (camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2])]
+        distortion = None if camera.distortion is None else [round(value, DECIMALS) for value in camera.distortion]
+        lens = {"width": camera.width, "height": camera.height, "K": K, "distortion": distortion}
+        if lens not in lenses:
+            lenses.append(lens)
+        quaternion = matrices_to_quaternions(camera.extrinsics[None, :3, :3])[0]
+        numbers = [[round(float(value), DECIMALS) for value in part] for part in (quaternion, camera.extrinsics[:3, 3])]
+        depth_range = camera.depth_range and [float(f"{depth:.6g}") for depth in camera.depth_range]
+        frames.append([Path(camera.name).name, lenses.index(lens), *numbers, depth_range])
+    return {"lenses": lenses, "frames": frames}
+
+
+def as_json(captures: Sequence[dict[str, Any]]) -> str:
+    """JSON with a line for each frame."""
+    texts = []
+    for capture in captures:
+        fields = []
+        for name, value in capture.items():
+            if name in ("frames", "lenses", "triples"):
+                rows = ",\n    ".join(json.dumps(row) for row in value)
+                fields.append(f'"{name}": [\n    {rows}]')
+            else:
+                fields.append(f'"{name}": {json.dumps(value)}')
+        texts.append("{" + ",\n   ".join(fields) + "}")
+    inside = ",\n  ".join(texts)
+    return f'{{"format": "{FORMAT}", "version": {VERSION}, "captures": [\n  {inside}]}}\n'
+
+
+def main() -> None:
+    """Run the command."""
+    run(choose_captures)
+
+
+if __name__ == "__main__":
+    main()
