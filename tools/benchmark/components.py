@@ -1,12 +1,8 @@
 """The rasteriser and .ply files, timed beside other implementations: numbers for docs/performance.md.
 
 python -P -m idesplat.tools.benchmark.components
-
-gsplat's torch reference projects and colours on a CPU, but composites with CUDA alone: that step is ours, in torch as
-well, with every fragment of the image at once, sorted by pixel and depth.
 """
 
-import math
 import sys
 import tempfile
 import time
@@ -21,37 +17,30 @@ from rich.console import Console
 from rich.table import Table
 
 from ...runtime.cli.terminal import run
+from ...runtime.geometry.intrinsics import intrinsic_matrix
 from ...runtime.inference.session import usable_cores
 from .runner import SETTLE_SECONDS, thread_environment
 from .worker import Prepared, Worker
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from ...runtime.splats.gaussians import Gaussians
 
 SIDE = 256
 FOCAL = 0.9 * SIDE
-DRAWN_SPLATS = 2 * SIDE * SIDE
+RENDERED_SPLATS = 2 * SIDE * SIDE
 FILE_SPLATS = 500_000
 PLY_COLUMNS = 41  # of SH degree 2, with normals
 
 Candidates = dict[str, tuple[Any, ...]]
 
 
-def main(
-    repeats: Annotated[int, typer.Option(help="Rounds.", min=1)] = 9,
-    threads: Annotated[int | None, typer.Option(help="torch's threads, instead of one a core.", min=1)] = None,
-) -> None:
+def main(repeats: Annotated[int, typer.Option(help="Rounds.", min=1)] = 9) -> None:
     """Time the rasteriser and .ply files."""
-    threads = threads or usable_cores()
     rasterizers: Candidates = {"NumPy": (rasterizer, False)}
     if find_spec("numba"):
         rasterizers["compiled (numba)"] = (rasterizer, True)
-    if find_spec("torch") and find_spec("gsplat"):
-        rasterizers = {"torch, gsplat's reference": (torch_rasterizer, threads), **rasterizers}
-    with thread_environment(threads), tempfile.TemporaryDirectory() as folder:
-        run_interleaved(f"{DRAWN_SPLATS:,} splats a pixel wide at {SIDE}x{SIDE}", rasterizers, repeats)
+    with thread_environment(usable_cores()), tempfile.TemporaryDirectory() as folder:
+        run_interleaved(f"{RENDERED_SPLATS:,} splats a pixel wide at {SIDE}x{SIDE}", rasterizers, repeats)
         run_interleaved(f"writing {FILE_SPLATS:,} splats, SH degree 2", _files(Path(folder), "write"), repeats)
         run_interleaved(f"reading {FILE_SPLATS:,} splats, SH degree 2", _files(Path(folder), "read"), repeats)
 
@@ -69,7 +58,7 @@ def run_interleaved(title: str, candidates: Candidates, repeats: int) -> None:
                 time.sleep(SETTLE_SECONDS)
                 seconds[name].append(worker.run().seconds)
     table = Table(title=title, title_justify="left")
-    table.add_column("")
+    table.add_column("candidate")
     for column in ("first run", "later, median", "spread", "ratio"):
         table.add_column(column, justify="right")
     base = next(iter(seconds.values()))
@@ -86,12 +75,12 @@ def run_interleaved(title: str, candidates: Candidates, repeats: int) -> None:
 
 
 def rasterizer(compiled: bool) -> Prepared:
-    """Ours, compiled or not; the first run includes what has to be compiled or loaded."""
+    """Our rasteriser, compiled or not; the first run includes compiling and loading."""
     if not compiled:
-        sys.modules["numba"] = None  # type: ignore[assignment]  # as if it were not installed
+        sys.modules["numba"] = None  # type: ignore[assignment]  # hide it
     from ...runtime.rendering.rasterizer import rasterize
 
-    splats, K = pixel_sized_splats(DRAWN_SPLATS), pinhole()
+    splats, K = pixel_sized_splats(RENDERED_SPLATS), pinhole()
 
     def run() -> None:
         rasterize(splats.means, splats.quats, splats.scales, splats.opacities, splats.sh, np.eye(4), K, SIDE, SIDE)
@@ -99,24 +88,8 @@ def rasterizer(compiled: bool) -> Prepared:
     return None, run
 
 
-def torch_rasterizer(threads: int) -> Prepared:
-    """gsplat's torch projection and colours, and compositing in torch."""
-    import torch
-
-    torch.set_num_threads(threads)
-    splats = pixel_sized_splats(DRAWN_SPLATS)
-    arrays = (splats.means, splats.quats, splats.scales, splats.opacities, splats.sh, np.eye(4), pinhole())
-    tensors = [torch.from_numpy(np.asarray(array, np.float32)) for array in arrays]
-
-    def run() -> None:
-        with torch.inference_mode():
-            torch_rasterize(*tensors)
-
-    return None, run
-
-
 def pixel_sized_splats(count: int) -> "Gaussians":
-    """Splats about as wide as a pixel of a camera at the origin, two at each pixel, as networks predict them."""
+    """Splats about a pixel wide in a camera at the origin, two at each pixel, as networks predict them."""
     from ...runtime.splats.gaussians import Gaussians
 
     rng = np.random.default_rng(0)
@@ -134,75 +107,20 @@ def pixel_sized_splats(count: int) -> "Gaussians":
 
 
 def pinhole() -> np.ndarray:
-    """Its camera's K, [3, 3]."""
-    return np.array([[FOCAL, 0, SIDE / 2], [0, FOCAL, SIDE / 2], [0, 0, 1]])
-
-
-def torch_rasterize(
-    means: "Tensor",
-    quats: "Tensor",
-    scales: "Tensor",
-    opacities: "Tensor",
-    sh: "Tensor",
-    viewmat: "Tensor",
-    K: "Tensor",
-) -> "Tensor":
-    """Red, green, blue, depth and alpha, [SIDE, SIDE, 5], of Gaussians that the camera sees."""
-    import torch
-    from gsplat.cuda import _torch_impl as reference
-
-    covariances, _ = reference._quat_scale_to_covar_preci(quats, scales, True, False)
-    radii, centres, depth, conics, _ = reference._fully_fused_projection(
-        means, covariances, viewmat[None], K[None], SIDE, SIDE
-    )
-    directions = means - torch.linalg.inv(viewmat)[:3, 3]
-    colours = torch.clamp_min(reference._spherical_harmonics(math.isqrt(sh.shape[1]) - 1, directions, sh) + 0.5, 0)
-    order = torch.argsort(depth[0])
-    order = order[(radii[0][order] > 0).all(dim=-1)]
-    paint = torch.cat([colours, depth[0][:, None], torch.ones(len(means), 1)], dim=1)
-    return _composite(centres[0][order], conics[0][order], opacities[order], paint[order])
-
-
-def _composite(centres: "Tensor", conics: "Tensor", opacities: "Tensor", paint: "Tensor") -> "Tensor":
-    """Blend splats, the nearest first: every fragment at once, sorted by pixel."""
-    import torch
-
-    reach = 2 * torch.log(opacities * 255).clamp_min(0)
-    determinant = conics[:, 0] * conics[:, 2] - conics[:, 1] ** 2
-    half = torch.sqrt(reach[:, None] * conics[:, [2, 0]] / determinant[:, None])
-    first = torch.ceil(centres - half - 0.5).clamp(0, SIDE).long()
-    size = ((torch.floor(centres + half - 0.5) + 1).clamp(0, SIDE).long() - first).clamp_min(0)
-    counts = size.prod(dim=1)
-    splat = torch.repeat_interleave(torch.arange(len(counts)), counts)
-    place = torch.arange(len(splat)) - (torch.cumsum(counts, 0) - counts)[splat]
-    columns = size[splat, 0]
-    column, row = first[splat, 0] + place % columns, first[splat, 1] + place // columns
-    dx, dy = column + 0.5 - centres[splat, 0], row + 0.5 - centres[splat, 1]
-    xx, xy, yy = conics[splat].unbind(-1)
-    alpha = torch.clamp_max(opacities[splat] * torch.exp(-0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy), 0.99)
-    drawn = alpha >= 1 / 255
-    alpha, splat, pixel = alpha[drawn], splat[drawn], (row * SIDE + column)[drawn]
-    by_pixel = torch.argsort(pixel, stable=True)
-    alpha, splat, pixel = alpha[by_pixel], splat[by_pixel], pixel[by_pixel]
-    passed = torch.log1p(-alpha).double()
-    running = torch.cumsum(passed, 0)
-    ends = torch.cumsum(torch.bincount(pixel, minlength=SIDE * SIDE), 0)
-    before = torch.cat([torch.zeros(1, dtype=torch.double), running])[torch.cat([torch.zeros(1).long(), ends[:-1]])]
-    running -= before[pixel]
-    weight = torch.where(running > math.log(1e-4), alpha * torch.exp(running - passed).float(), torch.zeros(()))
-    return torch.zeros(SIDE * SIDE, 5).index_add_(0, pixel, weight[:, None] * paint[splat]).view(SIDE, SIDE, 5)
+    """K of the camera of `pixel_sized_splats`, in pixels, [3, 3]."""
+    return intrinsic_matrix(FOCAL, FOCAL, SIDE / 2, SIDE / 2)
 
 
 # ---- files
 
 
 def _files(folder: Path, verb: str) -> Candidates:
-    """Ours beside the same bytes written or read with NumPy alone."""
+    """Our .ply files beside the same number of bytes written or read with NumPy alone."""
     return {"NumPy, the same bytes": (plain_file, folder, verb), "ours": (ply_file, folder, verb)}
 
 
 def plain_file(folder: Path, verb: str) -> Prepared:
-    """Bytes without a meaning: what the disk and the memory take."""
+    """A file of as many bytes as a .ply file: the time of disk and memory alone."""
     path, table = folder / "plain.bin", np.random.default_rng(0).random((FILE_SPLATS, PLY_COLUMNS), np.float32)
 
     def write() -> None:

@@ -1,4 +1,4 @@
-"""The sparse products in ONNX Runtime, gathered at once and in steps: numbers for docs/performance.md.
+"""Gather attention in ONNX Runtime, in one piece and in chunks of pixels: numbers for docs/performance.md.
 
 python -P -m idesplat.tools.benchmark.gather_attention
 """
@@ -24,15 +24,15 @@ from .runner import thread_environment
 from .worker import Prepared
 
 PAIRS = 2
-# The inputs, and which of their axes are open.
+# The inputs, and their dynamic axes.
 AXES = {"queries": {0: "pairs", 1: "pixels"}, "table": {0: "all"}, "rows": {0: "pairs", 2: "pixels"}}
 INPUTS = tuple(AXES)
 
 
 class Shape(NamedTuple):
-    """What one product works on: square maps, candidates of a pixel, channels of a row, pixels the candidates span.
+    """Sizes of gather attention: side of the square map, candidates of a pixel, channels, pixels that candidates span.
 
-    block: of so many pixels every map has a multiple.
+    block: the number of pixels of a map is a multiple of it.
     """
 
     side: int
@@ -43,13 +43,13 @@ class Shape(NamedTuple):
 
 
 SHAPES = {
-    "IDESplat, unit 1": Shape(64, 257, 256, 21, 16),
-    "IDESplat, unit 2": Shape(128, 129, 64, 4, 64),
-    "IDESplat, unit 3": Shape(256, 65, 32, 4, 256),
+    "IDESplat, DPBU 1": Shape(64, 257, 256, 21, 16),
+    "IDESplat, DPBU 2": Shape(128, 129, 64, 4, 64),
+    "IDESplat, DPBU 3": Shape(256, 65, 32, 4, 256),
     "DepthSplat, four pixels a candidate": Shape(64, 512, 128, 21, 16),
-    "idesplat-tiny, unit 1": Shape(64, 97, 64, 21, 64),
-    "idesplat-tiny, unit 2": Shape(128, 25, 32, 4, 256),
-    "idesplat-tiny, unit 3": Shape(256, 9, 8, 4, 1024),
+    "idesplat-tiny, DPBU 1": Shape(64, 97, 64, 21, 64),
+    "idesplat-tiny, DPBU 2": Shape(128, 25, 32, 4, 256),
+    "idesplat-tiny, DPBU 3": Shape(256, 9, 8, 4, 1024),
 }
 
 
@@ -57,22 +57,22 @@ def main(
     repeats: Annotated[int, typer.Option(help="Rounds.", min=1)] = 5,
     threads: Annotated[int, typer.Option(help="ONNX Runtime's threads.", min=1)] = 1,
 ) -> None:
-    """Time the correlation and the weighted sum of it, on two pairs of 256x256 views."""
+    """Time the gathered dot product and weighted sum, on two pairs of 256x256 views."""
     with thread_environment(threads):
         for name, shape in SHAPES.items():
             candidates = {
-                "gathered at once": (products, shape, False, threads),
-                "in steps": (products, shape, True, threads),
+                "in one piece": (gather_attention, shape, False, threads),
+                "chunked": (gather_attention, shape, True, threads),
             }
             run_interleaved(f"{name}: gathered dot and weighted sum", candidates, repeats)
 
 
-def products(shape: Shape, steps: bool, threads: int) -> Prepared:
-    """Both products, one after the other, as an exported graph has them or gathered at once."""
+def gather_attention(shape: Shape, in_chunks: bool, threads: int) -> Prepared:
+    """The gathered dot product and weighted sum, in chunks of pixels as an exported graph has them, or in one piece."""
     arrays = example(shape)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
-    graph = exported(shape.block, arrays, steps).SerializeToString()
+    graph = exported(shape.block, arrays, in_chunks).SerializeToString()
     session = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
     feed = dict(zip(INPUTS, arrays, strict=True))
 
@@ -83,27 +83,27 @@ def products(shape: Shape, steps: bool, threads: int) -> Prepared:
 
 
 class Both(nn.Module):
-    """One product after the other."""
+    """The gathered dot product, then the gathered weighted sum."""
 
     def __init__(self, block: int) -> None:
         super().__init__()
         self.gather_attention = GatherAttention(FEW, block)
 
     def forward(self, queries: Tensor, table: Tensor, rows: Tensor) -> Tensor:
-        """As `GatherAttention`: the rows weighed by their scores, [pairs, h * w, channels]."""
+        """As `GatherAttention`: the sum of the rows weighted by their scores, [pairs, h * w, channels]."""
         return self.gather_attention.gathered_weighted_sum(
             self.gather_attention.gathered_dot(queries, table, rows), table, rows
         )
 
 
-def exported(block: int, arrays: tuple[np.ndarray, ...], steps: bool) -> onnx.ModelProto:
-    """`Both` as a graph whose pairs and pixels are open."""
+def exported(block: int, arrays: tuple[np.ndarray, ...], in_chunks: bool) -> onnx.ModelProto:
+    """`Both` as a graph with dynamic numbers of pairs and pixels."""
     network = Both(block)
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # deprecation of the path, and tracing warnings
         path = Path(folder) / "both.onnx"
         tensors = tuple(torch.from_numpy(array) for array in arrays)
-        with chunked(network) if steps else nullcontext():
+        with chunked(network) if in_chunks else nullcontext():
             torch.onnx.export(
                 network, tensors, str(path), dynamo=False, opset_version=20, input_names=list(INPUTS), dynamic_axes=AXES
             )
@@ -111,7 +111,7 @@ def exported(block: int, arrays: tuple[np.ndarray, ...], steps: bool) -> onnx.Mo
 
 
 def example(shape: Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Queries, table and rows of two views whose pixels look along the other's rows."""
+    """Queries, table and rows of two views whose epipolar lines are the image's rows."""
     rng = np.random.default_rng(0)
     pixels = shape.side**2
     row, column = np.divmod(np.arange(pixels), shape.side)

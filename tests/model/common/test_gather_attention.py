@@ -39,7 +39,7 @@ def test_exported_values_are_the_networks_own() -> None:
         queries = rng.standard_normal((pairs, pixels, CHANNELS), np.float32)
         return queries, rng.standard_normal((2 * pixels, CHANNELS), np.float32), rows
 
-    model = exported(BLOCK, drawn(2, 4 * BLOCK), steps=True)
+    model = exported(BLOCK, drawn(2, 4 * BLOCK), in_chunks=True)
     onnx.checker.check_model(model, full_check=True)
     assert [node.op_type for node in model.graph.node].count("Loop") == 2
     assert {node.domain for node in model.graph.node} == {""}
