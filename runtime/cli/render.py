@@ -16,16 +16,16 @@ from ..images.png import save_png
 from ..images.sizes import parse_size
 from ..images.video_writer import check_video_support, open_video
 from ..rendering.cameras import (
-    FULL_TURN,
-    MOST_FRAMES,
-    STILL,
-    SWING,
-    along_path,
-    around,
-    check_shots,
-    fitted,
+    CAMERA_ORBIT_DEG,
+    MAX_FRAMES,
+    OVERVIEW_NAME,
+    SCENE_ORBIT_DEG,
+    check_image_sizes,
+    fit_camera,
     frame_names,
-    overview,
+    orbit_cameras,
+    overview_camera,
+    path_cameras,
 )
 from ..rendering.render import render_view
 from ..rendering.types import Rendering
@@ -59,7 +59,7 @@ def render(
     degrees: Annotated[
         float | None, typer.Option(help="Of the orbit: 360 by default, with cameras a swing of 30.", show_default=False)
     ] = None,
-    frames: Annotated[int, typer.Option(help=f"How many pictures --orbit and --path make, 1 to {MOST_FRAMES}.")] = 90,
+    frames: Annotated[int, typer.Option(help=f"How many pictures --orbit and --path make, 1 to {MAX_FRAMES}.")] = 90,
     fps: Annotated[float, typer.Option(help="Frames a second of an .mp4.")] = 30,
     size: Annotated[
         str | None, typer.Option(help=f"HEIGHTxWIDTH: the cameras' by default, or {SIZE}.", show_default=False)
@@ -79,8 +79,8 @@ def render(
     colour = _parse_background(background)
     if not 0 < fps <= 1000:
         raise InputError(f"--fps {fps:g}: expected frames a second, 1 to 1000")
-    if not 1 <= frames <= MOST_FRAMES:
-        raise InputError(f"--frames {frames}: expected 1 to {MOST_FRAMES} pictures")
+    if not 1 <= frames <= MAX_FRAMES:
+        raise InputError(f"--frames {frames}: expected 1 to {MAX_FRAMES} pictures")
     _check_out(out)
     if path and orbit:
         raise InputError("--path and --orbit: expected one of them")
@@ -88,13 +88,13 @@ def render(
     if path and not views:
         raise InputError("--path: needs the cameras that it leads through; give --cameras, or use --orbit")
     kinds = [COLOUR, *[DEPTH] * depth, *[ALPHA] * alpha]
-    names = frame_names(frames) if path or orbit else [view.name for view in views] or [STILL]
+    names = frame_names(frames) if path or orbit else [view.name for view in views] or [OVERVIEW_NAME]
     stems = _stems(names, out, kinds)
     _announce(scene, cameras, views, stems, out, kinds)
     gaussians = read_splats(scene)
     views = offset_cameras(views, read_offset(scene))
     shots = _shots(gaussians, views, orbit, path, degrees, frames, size)
-    check_shots(shots)
+    check_image_sizes(shots)
     draw = _drawer(gaussians, colour)
     if out.suffix.lower() == VIDEO:
         written = _film(draw, shots, out, fps, kinds)
@@ -179,13 +179,13 @@ def _shots(
 ) -> list[Camera]:
     """Where to draw the scene from."""
     if views and size:
-        views = [fitted(view, *parse_size(size)) for view in views]
+        views = [fit_camera(view, *parse_size(size)) for view in views]
     if path:
-        return along_path(views, frames)
+        return path_cameras(views, frames)
     if orbit:
-        centre = list(views) or [overview(gaussians, *parse_size(size or SIZE))]
-        return around(gaussians, centre, degrees or (SWING if views else FULL_TURN), frames)
-    return list(views) or [overview(gaussians, *parse_size(size or SIZE))]
+        centre = list(views) or [overview_camera(gaussians, *parse_size(size or SIZE))]
+        return orbit_cameras(gaussians, centre, degrees or (CAMERA_ORBIT_DEG if views else SCENE_ORBIT_DEG), frames)
+    return list(views) or [overview_camera(gaussians, *parse_size(size or SIZE))]
 
 
 def _drawer(gaussians: Gaussians, background: tuple[float, float, float]) -> Callable[[Camera], Rendering]:

@@ -1,9 +1,10 @@
-"""Draws Gaussians on a CPU with nothing but NumPy, the way gsplat draws them on a GPU.
+"""A rasteriser of Gaussians for the CPU, in NumPy or compiled by numba, with the semantics of gsplat.
 
-splats -> rows -> fragments -> pixels: each Gaussian is projected to an ellipse, the ellipse is cut into pixel rows,
-the rows into fragments (one splat at one pixel), and the fragments of a pixel are blended front to back. The image is
-drawn in bands, side by side on the machine's cores, and a band takes its splats nearest first, as many at a time as
-give a bounded number of fragments: memory does not grow with the overdraw, and what is hidden is not drawn.
+splats -> rows -> fragments -> pixels: each Gaussian is projected to an ellipse, the ellipse is cut into pixel rows, the
+rows into fragments (one splat at one pixel), and the fragments of a pixel are composited front to back (`types`). The
+image is rendered in bands of rows, in parallel on the machine's cores. A band takes its splats nearest first, as many
+at a time as give a bounded number of fragments: memory does not grow with the overdraw, and occluded splats are
+skipped.
 """
 
 import functools
@@ -17,19 +18,13 @@ from numpy.typing import ArrayLike, DTypeLike
 
 from ..errors import InputError
 from . import rasterizer_numpy
-from .types import (
-    PROJECTED_AT_ONCE,
-    Rendering,
-    Scene,
-    Splats,
-    View,
-)
+from .types import BLOCK_SIZE, GaussianArrays, Rendering, Splats, View
 
 # NumPy sorts 16-bit integers by radix, several times faster than wider ones, so a band has no more pixels than this.
-BAND_PIXELS = 1 << 16
+MAX_BAND_PIXELS = 1 << 16
 MAX_PIXELS = 1 << 27  # 20 bytes each, and as much again while the results are put together
-MIN_BANDS = 8  # several a core, so that the cores finish together
-MOST_THREADS = 8  # each holds the fragments of a chunk, some 30 MB
+MIN_BANDS = 8  # several for each core, so that the cores finish together
+MAX_THREADS = 8  # each holds the fragments of a chunk, some 30 MB
 
 
 def rasterize(
@@ -45,41 +40,41 @@ def rasterize(
     background: tuple[float, float, float] | np.ndarray = (0, 0, 0),
     near: float = 0.01,
 ) -> Rendering:
-    """Draw Gaussians as a pinhole camera sees them, with gsplat's arithmetic.
+    """Render Gaussians from a pinhole camera, with gsplat's arithmetic.
 
     means and scales (standard deviations) are in world units, quats are wxyz and need not be normalised, opacities lie
-    in [0, 1], sh is in the basis of 3DGS, degree 0 to 3. viewmat takes world to camera (OpenCV axes: x right, y down,
-    z forward), rigidly; K is in pixels, with pixel centres at .5. Gaussians whose centre is nearer than `near`, in
-    world units along the view axis, are not drawn.
+    in [0, 1], sh is in the basis of 3DGS, degree 0 to 3. viewmat is world-to-camera (OpenCV axes: x right, y down, z
+    forward) and rigid; K is in pixels, with pixel centres at .5. Gaussians whose z-depth is not above `near`, in world
+    units, are skipped.
 
-    Raises InputError if an argument has the wrong shape, is not finite, or is not a camera.
+    Raises InputError if an argument has the wrong shape, is not finite, or is not a pinhole camera.
     """
     gaussians = _checked_gaussians(means, quats, scales, opacities, sh)
-    camera = _checked_camera(viewmat, K, width, height, near)
+    view = _checked_view(viewmat, K, width, height, near)
     backdrop = _checked("background", background, (3,))
 
-    project, composite_band = _steps()
-    band_rows = min(ceil(height / MIN_BANDS), BAND_PIXELS // width)
+    project, composite_band = _kernels()
+    band_rows = min(ceil(height / MIN_BANDS), MAX_BAND_PIXELS // width)
     sums = np.empty((height, width, 5), np.float32)  # red, green, blue, depth, alpha
 
-    with ThreadPoolExecutor(min(MOST_THREADS, os.cpu_count() or 1)) as pool:
-        starts = range(0, max(len(gaussians.means), 1), PROJECTED_AT_ONCE)
-        blocks = pool.map(lambda start: project(gaussians, start, camera), starts)
+    with ThreadPoolExecutor(min(MAX_THREADS, os.cpu_count() or 1)) as pool:
+        starts = range(0, max(len(gaussians.means), 1), BLOCK_SIZE)
+        blocks = pool.map(lambda start: project(gaussians, start, view), starts)
         splats = Splats(*map(np.concatenate, zip(*blocks, strict=True)))
-        splats = splats.select(_nearest_first(splats.paint[:, 3]))
+        splats = splats.select(_argsort_depth(splats.features[:, 3]))
 
-        def draw(top: int) -> None:
+        def render_band(top: int) -> None:
             sums[top : top + band_rows] = composite_band(splats, top, min(band_rows, height - top), width)
 
-        list(pool.map(draw, range(0, height, band_rows)))
+        list(pool.map(render_band, range(0, height, band_rows)))
 
     depth, alpha = sums[..., 3].copy(), sums[..., 4].copy()
     return Rendering(sums[..., :3] + (1 - alpha[..., None]) * backdrop, alpha, depth)
 
 
 @functools.cache
-def _steps() -> tuple[Callable[..., "Splats"], Callable[..., np.ndarray]]:
-    """The two heavy steps, projecting a block and drawing a band: compiled where that is possible (extra `fast`)."""
+def _kernels() -> tuple[Callable[..., Splats], Callable[..., np.ndarray]]:
+    """The two expensive steps, projection of a block and compositing of a band; compiled with numba (extra `fast`)."""
     try:
         from . import rasterizer_numba as compiled
     except (ImportError, RuntimeError):
@@ -87,8 +82,8 @@ def _steps() -> tuple[Callable[..., "Splats"], Callable[..., np.ndarray]]:
     return compiled.project, compiled.composite_band
 
 
-def _nearest_first(depth: np.ndarray) -> np.ndarray:
-    """The order [splats] of positive float32 depths, equal ones as they stand.
+def _argsort_depth(depth: np.ndarray) -> np.ndarray:
+    """A stable argsort [splats] of positive float32 depths.
 
     Positive floats are in the order of their bits, and NumPy sorts halves of 16 bits by radix: five times faster.
     """
@@ -99,13 +94,13 @@ def _nearest_first(depth: np.ndarray) -> np.ndarray:
 
 def _checked_gaussians(
     means: np.ndarray, quats: np.ndarray, scales: np.ndarray, opacities: np.ndarray, sh: np.ndarray
-) -> Scene:
-    """The Gaussians, once the arrays agree in length and their values are finite."""
+) -> GaussianArrays:
+    """The arrays as float32, once they agree in length and their values are finite."""
     count = np.shape(means)[0] if np.ndim(means) else 0
     coefficients = np.shape(sh)[1] if np.ndim(sh) == 3 else 1
     if coefficients not in (1, 4, 9, 16):
         raise InputError(f"rasterize: sh has {coefficients} coefficients, expected 1, 4, 9 or 16 (degree 0 to 3)")
-    return Scene(
+    return GaussianArrays(
         _checked("means", means, (count, 3)),
         _checked("quats", quats, (count, 4)),
         _checked("scales", scales, (count, 3)),
@@ -114,10 +109,10 @@ def _checked_gaussians(
     )
 
 
-def _checked_camera(viewmat: np.ndarray, K: np.ndarray, width: int, height: int, near: float) -> View:
-    """The camera, once it is a pinhole camera with an image that can be drawn."""
-    if not (1 <= width <= BAND_PIXELS and 1 <= height <= BAND_PIXELS):
-        raise InputError(f"rasterize: the image is {width}x{height}, expected sides of 1 to {BAND_PIXELS} pixels")
+def _checked_view(viewmat: np.ndarray, K: np.ndarray, width: int, height: int, near: float) -> View:
+    """The camera, once it is a pinhole camera whose image can be rendered."""
+    if not (1 <= width <= MAX_BAND_PIXELS and 1 <= height <= MAX_BAND_PIXELS):
+        raise InputError(f"rasterize: the image is {width}x{height}, expected sides of 1 to {MAX_BAND_PIXELS} pixels")
     if width * height > MAX_PIXELS:
         raise InputError(f"rasterize: the image is {width}x{height}, expected at most {MAX_PIXELS} pixels in all")
     if not near > 0:

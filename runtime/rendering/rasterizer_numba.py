@@ -1,7 +1,9 @@
-"""The rasteriser's two heavy steps compiled by numba: the arithmetic of `rasterizer`, one splat after another.
+"""The rasteriser's two expensive steps compiled by numba, one splat after another.
 
-Importing this raises ImportError where numba (extra `fast`) is not installed, and RuntimeError where there is no folder
-to keep compiled code in: compiling anew in every process would take longer than drawing without.
+They repeat the arithmetic of `rasterizer_numpy`, `geometry.projection` and `geometry.sh`, in the same order of
+operations, and take the constants from there. Importing this raises ImportError where numba (extra `fast`) is not
+installed, and RuntimeError where there is no folder for compiled code: compiling in every process would take longer
+than NumPy does.
 """
 
 import functools
@@ -10,44 +12,35 @@ from math import exp, log
 import numba
 import numpy as np
 
+from ..geometry.projection import EPS2D, FOV_MARGIN
 from ..geometry.sh import SH_0, SH_1, SH_2, SH_3
-from .types import (
-    EPS2D,
-    FOV_MARGIN,
-    MAX_ALPHA,
-    MIN_ALPHA,
-    MIN_LOG_TRANSMITTANCE,
-    PROJECTED_AT_ONCE,
-    Scene,
-    Splats,
-    View,
-)
+from .types import BLOCK_SIZE, MAX_ALPHA, MIN_ALPHA, MIN_LOG_TRANSMITTANCE, GaussianArrays, Splats, View
 
-# Fragments are float32, as there: at a limit both must decide alike.
-LOWEST_ALPHA, HIGHEST_ALPHA = np.float32(MIN_ALPHA), np.float32(MAX_ALPHA)
+# Alpha is float32, as in NumPy's version: at a limit both must decide alike.
+MIN_ALPHA_32, MAX_ALPHA_32 = np.float32(MIN_ALPHA), np.float32(MAX_ALPHA)
 LOG_MIN_ALPHA = log(MIN_ALPHA)
 MIN_TRANSMITTANCE = exp(MIN_LOG_TRANSMITTANCE)
-CLOSED = 0.0  # the transmittance of a pixel that takes no more
+ENDED = 0.0  # stands for the transmittance of a pixel that takes no further fragments
 
 _compiled = functools.partial(numba.njit, cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 
 
-def project(scene: Scene, start: int, view: View) -> Splats:
-    """Those Gaussians of the block from `start` on that touch the image, as ellipses, in the order given."""
-    block = Scene(*(field[start : start + PROJECTED_AT_ONCE] for field in scene))
+def project(gaussians: GaussianArrays, start: int, view: View) -> Splats:
+    """Project the block of Gaussians from `start` on; those that touch the image, in the order given."""
+    block = GaussianArrays(*(field[start : start + BLOCK_SIZE] for field in gaussians))
     count = len(block.means)
     ellipses, spans = np.empty((6, count)), np.empty((3, count), np.int64)
-    paint = np.empty((count, 4), np.float32)
-    _project(*block, *view, ellipses, spans, paint)
-    splats = Splats._make([*ellipses, *spans, paint])
+    features = np.empty((count, 4), np.float32)
+    _project(*block, *view, ellipses, spans, features)
+    splats = Splats._make([*ellipses, *spans, features])
     touching = (splats.rows > 0) & (splats.columns > 0)
     return splats if touching.all() else splats.select(np.flatnonzero(touching))
 
 
 def composite_band(splats: Splats, top: int, rows: int, width: int) -> np.ndarray:
-    """Sums [rows, width, 5] of red, green, blue, depth and alpha over the image rows from `top` on."""
+    """Composited sums [rows, width, 5] of red, green, blue, depth and alpha, for the image rows from `top` on."""
     sums = np.zeros((rows, width, 5), np.float32)
-    _draw_band(*splats, top, sums)
+    _composite_band(*splats, top, sums)
     return sums
 
 
@@ -65,9 +58,9 @@ def _project(
     near: float,
     ellipses: np.ndarray,  # [6, gaussians]
     spans: np.ndarray,  # [3, gaussians]
-    paint: np.ndarray,  # [gaussians, 4]
+    features: np.ndarray,  # [gaussians, 4]
 ) -> None:
-    """Fill the fields of `Splats`; a Gaussian that is not seen gets no rows."""
+    """Fill the fields of `Splats`; a Gaussian that is not visible gets no rows."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     margin_x, margin_y = FOV_MARGIN * 0.5 * width / fx, FOV_MARGIN * 0.5 * height / fy
     position = np.empty(3)
@@ -81,27 +74,27 @@ def _project(
             for other in range(3):
                 point[axis] += viewmat[axis, other] * means[index, other]
         z = point[2]
-        if not (z > near and opacities[index] >= LOWEST_ALPHA):
+        if not (z > near and opacities[index] >= MIN_ALPHA_32):
             spans[1, index] = 0
             continue
-        across, down = point[0] / z, point[1] / z
-        x, y = fx * across + cx, fy * down + cy
-        across = min(max(across, -cx / fx - margin_x), (width - cx) / fx + margin_x)
-        down = min(max(down, -cy / fy - margin_y), (height - cy) / fy + margin_y)
+        slope_x, slope_y = point[0] / z, point[1] / z
+        x, y = fx * slope_x + cx, fy * slope_y + cy
+        slope_x = min(max(slope_x, -cx / fx - margin_x), (width - cx) / fx + margin_x)
+        slope_y = min(max(slope_y, -cy / fy - margin_y), (height - cy) / fy + margin_y)
         _rotation(quats[index], rotation)
         xx, xy, yy = 0.0, 0.0, 0.0
         for column in range(3):
             half_x, half_y = 0.0, 0.0
             for row in range(3):
                 along = rotation[row, column] * scales[index, column]
-                half_x += fx / z * (viewmat[0, row] - across * viewmat[2, row]) * along
-                half_y += fy / z * (viewmat[1, row] - down * viewmat[2, row]) * along
+                half_x += fx / z * (viewmat[0, row] - slope_x * viewmat[2, row]) * along
+                half_y += fy / z * (viewmat[1, row] - slope_y * viewmat[2, row]) * along
             xx += half_x * half_x
             xy += half_x * half_y
             yy += half_y * half_y
         x_variance, y_variance = xx + EPS2D, yy + EPS2D
         shear = xy / y_variance
-        reach = np.log(np.float64(opacities[index] / LOWEST_ALPHA))
+        reach = np.log(np.float64(opacities[index] / MIN_ALPHA_32))
         ellipses[0, index], ellipses[1, index], ellipses[2, index] = x, y, shear
         ellipses[3, index] = max(x_variance - shear * shear * y_variance, EPS2D)
         ellipses[4, index], ellipses[5, index] = y_variance, reach
@@ -112,8 +105,8 @@ def _project(
             colour = np.float32(0.5)
             for coefficient in range(len(basis)):
                 colour += basis[coefficient] * sh[index, coefficient, channel]
-            paint[index, channel] = max(colour, np.float32(0))
-        paint[index, 3] = z
+            features[index, channel] = max(colour, np.float32(0))
+        features[index, 3] = z
 
 
 @_compiled()
@@ -129,7 +122,7 @@ def _rotation(quat: np.ndarray, rotation: np.ndarray) -> None:
 
 @_compiled()
 def _span(centre: float, half: float, size: int) -> tuple[int, int]:
-    """First pixel whose centre lies within centre +- half, and how many do, of an image `size` pixels long."""
+    """The first pixel whose centre lies within centre +- half, and their number, along a side of `size` pixels."""
     first = min(max(np.ceil(centre - half - 0.5), 0.0), float(size))
     last = min(max(np.floor(centre + half - 0.5), -1.0), size - 1.0)
     return int(first), max(int(last - first + 1), 0)
@@ -137,7 +130,7 @@ def _span(centre: float, half: float, size: int) -> tuple[int, int]:
 
 @_compiled()
 def _fill_basis(mean: np.ndarray, position: np.ndarray, basis: np.ndarray) -> None:
-    """Fill the spherical harmonics of 3DGS, [coefficients], in the direction from `position` to `mean`."""
+    """Fill the SH basis functions [coefficients] in the direction from `position` to `mean`."""
     basis[0] = SH_0
     if len(basis) == 1:
         return
@@ -161,7 +154,7 @@ def _fill_basis(mean: np.ndarray, position: np.ndarray, basis: np.ndarray) -> No
 
 
 @_compiled()
-def _draw_band(
+def _composite_band(
     x: np.ndarray,
     y: np.ndarray,
     shear: np.ndarray,
@@ -171,11 +164,11 @@ def _draw_band(
     first_row: np.ndarray,
     rows: np.ndarray,
     columns: np.ndarray,
-    paint: np.ndarray,
+    features: np.ndarray,
     top: int,
     sums: np.ndarray,  # [band rows, width, 5]
 ) -> None:
-    """Blend the splats, nearest first, into the rows of the image from `top` on."""
+    """Composite the splats, nearest first, into the rows of the image from `top` on."""
     band_rows, width, _ = sums.shape
     transmittance = np.ones((band_rows, width))
     still_open = band_rows * width
@@ -190,20 +183,20 @@ def _draw_band(
             log_peak = np.float32(reach_here + LOG_MIN_ALPHA)
             for step in range(length):
                 before = transmittance[row - top, first + step]
-                if before == CLOSED:
+                if before == ENDED:
                     continue
                 falloff = (distance + np.float32(step)) * sharpness
-                alpha = min(max(np.exp(log_peak - falloff * falloff), LOWEST_ALPHA), HIGHEST_ALPHA)
+                alpha = min(max(np.exp(log_peak - falloff * falloff), MIN_ALPHA_32), MAX_ALPHA_32)
                 after = before * (np.float32(1) - alpha)
-                if after <= MIN_TRANSMITTANCE:  # one too many: it is not drawn
-                    transmittance[row - top, first + step] = CLOSED
+                if after <= MIN_TRANSMITTANCE:  # this fragment is skipped, too
+                    transmittance[row - top, first + step] = ENDED
                     still_open -= 1
                     continue
                 transmittance[row - top, first + step] = after
                 weight = alpha * np.float32(before)
                 pixel = sums[row - top, first + step]
                 for channel in range(4):
-                    pixel[channel] += weight * paint[splat, channel]
+                    pixel[channel] += weight * features[splat, channel]
                 pixel[4] += weight
         if still_open == 0:
             break

@@ -1,25 +1,33 @@
-"""What rasterisers take and give, and the constants of EWA splatting (Zwicker et al. 2001) as gsplat has them."""
+"""What the rasteriser takes and returns, and the constants of compositing.
+
+Compositing as in 3DGS (Kerbl et al. 2023, eq. 3): over the splats i that cover a pixel, nearest first,
+
+    C = sum_i c_i alpha_i T_i + T C_background,    T_i = prod_{j < i} (1 - alpha_j),
+    alpha_i = min(opacity_i exp(-d^T Sigma'_i^-1 d / 2), MAX_ALPHA),
+
+d being the pixel's offset from the splat's centre and Sigma' its 2D covariance (`geometry.projection`). As in gsplat,
+fragments with alpha below MIN_ALPHA are skipped, and a pixel ends before the fragment that would bring T to 1e-4.
+"""
 
 from math import log
 from typing import NamedTuple
 
 import numpy as np
 
-EPS2D = 0.3  # px^2, added to the projected covariance: no splat is thinner than a pixel
-FOV_MARGIN = 0.3  # share of the half image by which the Jacobian's direction may leave the image
-MIN_ALPHA = 1 / 255  # a fragment below it is not drawn
+MIN_ALPHA = 1 / 255
 MAX_ALPHA = 0.99
-# Light left below which nothing further is drawn. Two fragments at MAX_ALPHA reach 1e-4 itself; the slack keeps the
-# second one whichever way float32 rounds, as exact arithmetic on doubles does.
+# log(1e-4), with slack: two fragments at MAX_ALPHA leave exactly 1e-4, and the second must be kept whichever way
+# float32 rounds, as it is in float64.
 MIN_LOG_TRANSMITTANCE = log(1e-4) - 1e-5
+BLOCK_SIZE = 1 << 15  # Gaussians projected at once: the temporaries of a block fit the cache
 
 
 class Rendering(NamedTuple):
-    """A drawn view, all float32.
+    """A rendered view, all float32.
 
     rgb: colour over the background, at least 0 and usually at most 1, [height, width, 3].
-    alpha: share of the light that the Gaussians stop, in [0, 1], [height, width].
-    depth: view depth in world units weighted by alpha, not divided by it: 0 where nothing is, [height, width].
+    alpha: 1 - T after the last fragment, in [0, 1], [height, width].
+    depth: sum_i z_i alpha_i T_i, z-depth in world units not divided by alpha: 0 where nothing is, [height, width].
     """
 
     rgb: np.ndarray
@@ -27,8 +35,8 @@ class Rendering(NamedTuple):
     depth: np.ndarray
 
 
-class Scene(NamedTuple):
-    """The arguments of `rasterize` that stand for the scene, checked, all float32."""
+class GaussianArrays(NamedTuple):
+    """The Gaussians given to `rasterize`, checked, all float32; shapes as in `Gaussians`."""
 
     means: np.ndarray
     quats: np.ndarray
@@ -38,7 +46,7 @@ class Scene(NamedTuple):
 
 
 class View(NamedTuple):
-    """The arguments of `rasterize` that stand for the view, checked, the matrices float64."""
+    """The camera given to `rasterize`, checked, the matrices float64."""
 
     viewmat: np.ndarray
     K: np.ndarray
@@ -50,8 +58,9 @@ class View(NamedTuple):
 class Splats(NamedTuple):
     """Projected Gaussians that touch the image, in pixels. All [splats], float64 unless said otherwise.
 
-    An ellipse is kept row by row: on the row at distance dy from the centre it is a 1-D Gaussian centred at
-    x + shear * dy with variance row_variance, its peak lower by dy^2 / (2 * y_variance).
+    An ellipse is evaluated row by row. On the row at distance dy from the centre, the 2D Gaussian with covariance
+    (xx, xy, yy) is a 1D Gaussian centred at x + shear * dy, shear = xy / yy, with the variance xx - xy^2 / yy
+    (row_variance), and its exponent is lower by dy^2 / (2 yy).
     """
 
     x: np.ndarray
@@ -59,17 +68,14 @@ class Splats(NamedTuple):
     shear: np.ndarray
     row_variance: np.ndarray
     y_variance: np.ndarray
-    reach: np.ndarray  # log(opacity / MIN_ALPHA): how far the exponent may fall
+    reach: np.ndarray  # log(opacity / MIN_ALPHA): how far the exponent may fall before alpha is below MIN_ALPHA
     first_row: np.ndarray  # int64
     rows: np.ndarray  # int64
-    columns: np.ndarray  # int64, width of the box around the ellipse
-    paint: np.ndarray  # [splats, 4] float32: red, green, blue, depth
+    columns: np.ndarray  # int64, width of the bounding box of the ellipse
+    features: np.ndarray  # [splats, 4] float32: red, green, blue, depth
 
     def select(self, index: np.ndarray | slice) -> "Splats":
-        """These splats only, in this order."""
+        """The splats at these indices, in this order."""
         if isinstance(index, slice):
             return Splats(*(field[index] for field in self))
         return Splats(*(field.take(index, axis=0) for field in self))
-
-
-PROJECTED_AT_ONCE = 1 << 15  # splats: the temporaries of a block stay in the cache

@@ -1,26 +1,25 @@
-"""The axes of files that do not have OpenCV's, and the half turns that lead there and back."""
+"""Axis conventions of splat files that differ from OpenCV's (x right, y down, z forward), and the conversion."""
 
 import numpy as np
 
+from ..geometry.sh import sh_axis_signs
 from .gaussians import Gaussians
 
-# Signs of x, y and z in other frames; each a half turn, which is its own inverse.
-OPENGL = (1, -1, -1)  # x right, y up, z backward, as .spz has it
-GLTF = (-1, -1, 1)  # x left, y up, z forward, as .glb has it
-
-# The axes in which each spherical harmonic of degree 0 to 3 is odd: it changes sign with each of them.
-ODD_IN = ("", "y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
+# Signs of x, y and z relative to OpenCV's axes. Each is a rotation by 180 degrees, which is its own inverse.
+OPENGL = (1, -1, -1)  # x right, y up, z backward: .spz
+GLTF = (-1, -1, 1)  # x left, y up, z forward: .glb
 
 
 def convert_axes(gaussians: Gaussians, signs: tuple[int, int, int]) -> Gaussians:
-    """The same Gaussians seen in another frame: means, rotations and spherical harmonics turned."""
-    sign = dict(zip("xyz", signs, strict=True))
-    odd = [np.prod([sign[axis] for axis in axes]) for axes in ODD_IN[: gaussians.sh.shape[1]]]
+    """The Gaussians in a frame whose axes are multiplied by `signs`, two of them -1; applied twice, the identity.
+
+    The rotation R of a Gaussian becomes D R D with D = diag(signs): its quaternion (w, v) becomes (w, D v). The factor
+    D on the right changes the signs of the Gaussian's own axes, which its covariance does not depend on.
+    """
     return Gaussians(
         means=gaussians.means * np.array(signs, np.float32),
         scales=gaussians.scales,
-        # The axis of each rotation turns; that the ellipsoid's own axes turn, too, changes nothing about it.
         quats=gaussians.quats * np.array([1, *signs], np.float32),
         opacities=gaussians.opacities,
-        sh=gaussians.sh * np.array(odd, np.float32)[:, None],
+        sh=gaussians.sh * sh_axis_signs(signs, gaussians.sh.shape[1])[:, None],
     )

@@ -20,7 +20,7 @@ from ..cameras.camera import Camera
 from ..errors import InputError
 from ..geometry.quaternions import matrices_to_quaternions, quaternions_to_matrices
 from ..images.colormaps import to_uint8
-from ..rendering.cameras import focus, overview
+from ..rendering.cameras import focus_depth, overview_camera
 from ..splats.gaussians import Gaussians
 from .server import free_port, only_own_page
 
@@ -66,8 +66,8 @@ def serving(
     scene is seen. A click at another viewpoint leads there.
     Raises InputError if viser is not installed, the place cannot be served at, or there is nothing to see.
     """
-    first = viewpoints[0].camera if viewpoints else overview(gaussians, *SIZE)
-    unit = DISTANCE / focus(gaussians, first)
+    first = viewpoints[0].camera if viewpoints else overview_camera(gaussians, *SIZE)
+    unit = DISTANCE / focus_depth(gaussians, first)
     server = _start(host, port)
     try:
         server.gui.configure_theme(show_logo=False, show_share_button=False)

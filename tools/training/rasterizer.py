@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ...runtime.geometry.projection import EPS2D, FOV_MARGIN
+from ...runtime.geometry.sh import SH_0, SH_1, SH_2, SH_3
+from ...runtime.rendering.types import MAX_ALPHA, MIN_ALPHA
+
 NEAR = 0.01  # scene units
-BLUR = 0.3  # pixels^2 added to the projected covariance
-FIELD_SLACK = 0.3  # of half the field of view: how far outside of it the projection is linearised as at its rim
-MAX_ALPHA = 0.99
-MIN_ALPHA = 1 / 255
 MIN_TRANSMITTANCE = 1e-4
 
 _compiled = functools.partial(
@@ -68,7 +68,7 @@ def _project(
     x, y, z = camera_means.unbind(-1)
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     centres = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
-    slack_x, slack_y = FIELD_SLACK * 0.5 * width / fx, FIELD_SLACK * 0.5 * height / fy
+    slack_x, slack_y = FOV_MARGIN * 0.5 * width / fx, FOV_MARGIN * 0.5 * height / fy
     slope_x = torch.clamp(x / z, -cx / fx - slack_x, (width - cx) / fx + slack_x)
     slope_y = torch.clamp(y / z, -cy / fy - slack_y, (height - cy) / fy + slack_y)
     rotation = viewmat[:3, :3]
@@ -78,9 +78,9 @@ def _project(
     axes = _scaled_axes(quats, scales)  # [gaussians, 3, 3]
     half_u = (row_u[:, :, None] * axes).sum(dim=1)  # [gaussians, 3]
     half_v = (row_v[:, :, None] * axes).sum(dim=1)
-    xx = (half_u * half_u).sum(dim=-1) + BLUR
+    xx = (half_u * half_u).sum(dim=-1) + EPS2D
     xy = (half_u * half_v).sum(dim=-1)
-    yy = (half_v * half_v).sum(dim=-1) + BLUR
+    yy = (half_v * half_v).sum(dim=-1) + EPS2D
     determinant = xx * yy - xy * xy
     return centres, torch.stack([yy, -xy, xx], dim=-1) / determinant[:, None]
 
@@ -103,20 +103,20 @@ def _colours(sh: Tensor, means: Tensor, camera: Tensor) -> Tensor:
     """Colour of the Gaussians as seen from `camera` [3], [gaussians, 3]."""
     count = sh.shape[1]
     if count == 1:
-        return torch.clamp_min(0.28209479177387814 * sh[:, 0] + 0.5, 0)
+        return torch.clamp_min(SH_0 * sh[:, 0] + 0.5, 0)
     x, y, z = torch.nn.functional.normalize(means - camera, dim=-1).unbind(-1)
-    basis = [torch.full_like(x, 0.28209479177387814)]
-    basis += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
+    basis = [torch.full_like(x, SH_0)]
+    basis += [-SH_1 * y, SH_1 * z, -SH_1 * x]
     if count > 4:
-        basis += [1.0925484305920792 * x * y, -1.0925484305920792 * y * z]
-        basis += [0.31539156525252005 * (2 * z * z - x * x - y * y)]
-        basis += [-1.0925484305920792 * x * z, 0.5462742152960396 * (x * x - y * y)]
+        basis += [SH_2[0] * x * y, -SH_2[0] * y * z]
+        basis += [SH_2[1] * (2 * z * z - x * x - y * y)]
+        basis += [-SH_2[0] * x * z, SH_2[2] * (x * x - y * y)]
     if count > 9:
-        basis += [-0.5900435899266435 * y * (3 * x * x - y * y), 2.890611442640554 * x * y * z]
-        basis += [-0.4570457994644658 * y * (4 * z * z - x * x - y * y)]
-        basis += [0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y)]
-        basis += [-0.4570457994644658 * x * (4 * z * z - x * x - y * y)]
-        basis += [1.445305721320277 * z * (x * x - y * y), -0.5900435899266435 * x * (x * x - 3 * y * y)]
+        basis += [-SH_3[0] * y * (3 * x * x - y * y), SH_3[1] * x * y * z]
+        basis += [-SH_3[2] * y * (4 * z * z - x * x - y * y)]
+        basis += [SH_3[3] * z * (2 * z * z - 3 * x * x - 3 * y * y)]
+        basis += [-SH_3[2] * x * (4 * z * z - x * x - y * y)]
+        basis += [SH_3[4] * z * (x * x - y * y), -SH_3[0] * x * (x * x - 3 * y * y)]
     return torch.clamp_min((torch.stack(basis, dim=-1)[:, :, None] * sh).sum(dim=1) + 0.5, 0)
 
 

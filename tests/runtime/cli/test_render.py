@@ -16,17 +16,16 @@ from idesplat.runtime.cameras.io import write_cameras
 from idesplat.runtime.cli import render
 from idesplat.runtime.cli.render import main
 from idesplat.runtime.errors import InputError
+from idesplat.runtime.geometry.sh import SH_0
 from idesplat.runtime.geometry.trajectories import interpolate_extrinsics, orbit_extrinsics
 from idesplat.runtime.images import video_writer as video_out
 from idesplat.runtime.images.png import save_depth_png, save_png
 from idesplat.runtime.images.video_writer import open_video
-from idesplat.runtime.rendering.cameras import around, fitted, overview
+from idesplat.runtime.rendering.cameras import fit_camera, orbit_cameras, overview_camera
 from idesplat.runtime.rendering.rasterizer import rasterize
 from idesplat.runtime.rendering.render import render_view
 from idesplat.runtime.splats.formats.ply import read_ply, write_ply
 from idesplat.runtime.splats.gaussians import Gaussians
-
-SH_0 = 0.28209479177387814
 
 
 def one_gaussian(position: tuple[float, float, float], rgb: tuple[float, float, float]) -> Gaussians:
@@ -222,17 +221,17 @@ def psnr(drawn: np.ndarray, expected: np.ndarray) -> float:
 
 @pytest.mark.parametrize(("height", "width"), [(40, 60), (60, 40)])
 def test_an_overview_shows_all_of_the_scene_and_little_else(height: int, width: int) -> None:
-    camera = overview(a_ball_of_gaussians(), height, width)
+    camera = overview_camera(a_ball_of_gaussians(), height, width)
     alpha = render_view(a_ball_of_gaussians(), camera.extrinsics, camera.K, width, height).alpha
     rows, columns = np.nonzero(alpha > 0.2)
     assert rows.min() > 0 and rows.max() < height - 1 and columns.min() > 0 and columns.max() < width - 1
     # It fits the sphere around the box, not the ball itself, hence with room to spare.
     assert np.ptp(rows) > 0.4 * min(height, width) and np.ptp(columns) > 0.4 * min(height, width)
     np.testing.assert_array_equal(camera.extrinsics[:3, :3], np.eye(3))
-    with pytest.raises(InputError, match="nothing to draw"):
+    with pytest.raises(InputError, match="nothing to render"):
         faint = a_ball_of_gaussians()
         faint.opacities[:] = 0.01
-        overview(faint, height, width)
+        overview_camera(faint, height, width)
 
 
 def test_an_orbit_keeps_looking_at_its_pivot() -> None:
@@ -258,23 +257,23 @@ def test_an_orbit_keeps_looking_at_its_pivot() -> None:
 def test_an_orbit_goes_around_what_the_cameras_look_at() -> None:
     ball = a_ball_of_gaussians((0, 0, 0))
     cameras = [Camera(f"{x}", 40, 30, pinhole(40, 30), pose((0, 0, 0), (x, 0, -4))) for x in (-0.1, 0.0, 0.1)]
-    shots = around(ball, cameras, 360, 4)
+    shots = orbit_cameras(ball, cameras, 360, 4)
     np.testing.assert_allclose(shots[0].extrinsics, cameras[1].extrinsics, atol=1e-12)
     opposite = shots[2].extrinsics
     np.testing.assert_allclose(opposite[:3, 2], [0, 0, -1], atol=1e-9)
     assert -1 < (opposite[2, 3] - 4) / 2 < 0  # the pivot is on the ball's near side, between -1 and 0
     with pytest.raises(InputError, match="sees nothing of the scene"):
-        around(ball, [Camera("away", 40, 30, pinhole(40, 30), pose((0, np.pi, 0), (0, 0, -4)))], 360, 4)
+        orbit_cameras(ball, [Camera("away", 40, 30, pinhole(40, 30), pose((0, np.pi, 0), (0, 0, -4)))], 360, 4)
 
 
 def test_another_size_shows_what_the_camera_showed() -> None:
     ball = a_ball_of_gaussians((0, 0, 4))
     camera = Camera("a", 60, 40, pinhole(60, 40), np.eye(4))
-    wide = fitted(camera, 40, 100)
+    wide = fit_camera(camera, 40, 100)
     whole = render_view(ball, wide.extrinsics, wide.K, 100, 40).rgb
     own = render_view(ball, camera.extrinsics, camera.K, 60, 40).rgb
     np.testing.assert_allclose(whole[:, 20:80], own, atol=1e-5)
-    half = fitted(camera, 20, 30)
+    half = fit_camera(camera, 20, 30)
     np.testing.assert_allclose(half.K, [[30, 0, 15], [0, 30, 10], [0, 0, 1]])
 
 
@@ -282,7 +281,7 @@ def test_a_still_without_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     write_ply(tmp_path / "scene.ply", a_ball_of_gaussians())
     assert run(monkeypatch, tmp_path / "scene.ply", "--out", tmp_path / "still.png", "--size", "48x64") == 0
     picture = read_rgb(tmp_path / "still.png")
-    camera = overview(a_ball_of_gaussians(), 48, 64)
+    camera = overview_camera(a_ball_of_gaussians(), 48, 64)
     expected = render_view(a_ball_of_gaussians(), camera.extrinsics, camera.K, 64, 48).rgb
     assert psnr(picture, expected) > 45
     assert {path.name for path in tmp_path.iterdir()} == {"scene.ply", "still.png"}
@@ -311,7 +310,7 @@ def test_an_orbit_as_a_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ca
     out = tmp_path / "orbit.mp4"
     options = ("--orbit", "--frames", 6, "--fps", 12, "--size", "97x128", "--depth", "--alpha")
     assert run(monkeypatch, tmp_path / "scene.ply", "--out", out, *options) == 0
-    shots = around(ball, [overview(ball, 97, 128)], 360, 6)
+    shots = orbit_cameras(ball, [overview_camera(ball, 97, 128)], 360, 6)
     films = {name: read_video(tmp_path / f"orbit{name}.mp4") for name in ("", "-depth", "-alpha")}
     assert {path.name for path in tmp_path.iterdir()} == {"scene.ply", *(f"orbit{name}.mp4" for name in films)}
     for frames, fps in films.values():

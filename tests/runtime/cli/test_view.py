@@ -15,7 +15,7 @@ from idesplat.runtime.cameras.io import read_cameras, write_cameras
 from idesplat.runtime.cli.view import main, read_viewpoints
 from idesplat.runtime.geometry.quaternions import matrices_to_quaternions
 from idesplat.runtime.images.png import save_png
-from idesplat.runtime.rendering.cameras import overview
+from idesplat.runtime.rendering.cameras import overview_camera
 from idesplat.runtime.rendering.render import render_view
 from idesplat.runtime.splats.formats.ply import write_ply
 from idesplat.runtime.splats.gaussians import Gaussians, with_colours
@@ -213,7 +213,7 @@ def test_file_to_send(opened, folder, drawn, tmp_path, monkeypatch, capsys):
 def test_scene_without_cameras(opened, folder, gaussians, tmp_path):
     html = tmp_path / "scene.html"
     assert run_command(main, folder / "scene.ply", "--html", html) == 0
-    above = overview(gaussians, HEIGHT, WIDTH)
+    above = overview_camera(gaussians, HEIGHT, WIDTH)
     drawn = render_view(gaussians, above.extrinsics, above.K, WIDTH, HEIGHT, WHITE).rgb
     shows(opened(html.as_uri()).scene(drawn), drawn)
 

@@ -28,7 +28,7 @@ STEPS = {
 
 
 def use_steps(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    monkeypatch.setattr(rasterizer, "_steps", lambda: STEPS[name])
+    monkeypatch.setattr(rasterizer, "_kernels", lambda: STEPS[name])
 
 
 @pytest.fixture(params=STEPS)
@@ -46,7 +46,7 @@ def reference_case(case: str) -> tuple:
 
 
 def test_numba_is_used_where_it_is_installed() -> None:
-    assert rasterizer._steps() == STEPS["compiled"]
+    assert rasterizer._kernels() == STEPS["compiled"]
 
 
 @pytest.mark.usefixtures("steps")
@@ -93,7 +93,7 @@ def test_draws_where_nothing_can_be_compiled(numba: str, tmp_path: Path) -> None
         "import numpy as np\n"
         "g = np.zeros((1, 3)) + [0, 0, 2], np.ones((1, 4)), np.ones((1, 3)), np.ones(1), np.zeros((1, 1, 3))\n"
         "drawn = rasterizer.rasterize(*g, np.eye(4), np.diag([8.0, 8.0, 1.0]), 8, 8)\n"
-        "assert drawn.alpha[0, 0] > 0.9 and rasterizer._steps()[0] is rasterizer.rasterizer_numpy.project\n"
+        "assert drawn.alpha[0, 0] > 0.9 and rasterizer._kernels()[0] is rasterizer.rasterizer_numpy.project\n"
     )
     environment = os.environ | {"PYTHONPATH": str(tmp_path)}
     subprocess.run([sys.executable, "-c", program], check=True, env=environment, timeout=60)
@@ -103,8 +103,8 @@ def test_depths_are_sorted_as_numpy_sorts_them() -> None:
     rng = np.random.default_rng(0)
     depth = np.repeat(np.exp(rng.uniform(-80, 80, 500)).astype(np.float32), 3)
     rng.shuffle(depth)
-    np.testing.assert_array_equal(rasterizer._nearest_first(depth), np.argsort(depth, kind="stable"))
-    assert len(rasterizer._nearest_first(depth[:0])) == 0
+    np.testing.assert_array_equal(rasterizer._argsort_depth(depth), np.argsort(depth, kind="stable"))
+    assert len(rasterizer._argsort_depth(depth[:0])) == 0
 
 
 @pytest.mark.usefixtures("steps")
@@ -125,9 +125,9 @@ def test_many_chunks_give_what_one_gives(monkeypatch: pytest.MonkeyPatch) -> Non
     scene = random_scene(np.random.default_rng(5), splats=400, degree=1)
     whole = rasterize(*scene)
     assert whole.alpha.max() > 0.999
-    monkeypatch.setattr("idesplat.runtime.rendering.rasterizer_numpy.FRAGMENTS_AT_ONCE", 500)
-    monkeypatch.setattr("idesplat.runtime.rendering.rasterizer.PROJECTED_AT_ONCE", 64)
-    monkeypatch.setattr("idesplat.runtime.rendering.rasterizer_numpy.PROJECTED_AT_ONCE", 64)
+    monkeypatch.setattr("idesplat.runtime.rendering.rasterizer_numpy.CHUNK_FRAGMENTS", 500)
+    monkeypatch.setattr("idesplat.runtime.rendering.rasterizer.BLOCK_SIZE", 64)
+    monkeypatch.setattr("idesplat.runtime.rendering.rasterizer_numpy.BLOCK_SIZE", 64)
     pieces = rasterize(*scene)
     for ours, theirs in zip(pieces, whole, strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=5e-5)
