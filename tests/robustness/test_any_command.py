@@ -28,6 +28,7 @@ from idesplat.tools.benchmark import cli as bench
 from idesplat.tools.evaluation import cli as evaluate
 from idesplat.tools.evaluation.captures import checkouts
 from idesplat.tools.training import cli as train
+from idesplat.tools.training import trainer
 from mutations import TEXTS, make_odd_paths, mutated, mutated_json, tried
 from scene_files import as_scene, pinholes, snapshot, write_scene
 from tiny_model import write_model
@@ -178,7 +179,7 @@ def place(good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, presets: 
     monkeypatch.chdir(work)
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))
     monkeypatch.setattr(checkouts, "fetch_checkout", no_network)
-    monkeypatch.setattr(train.Run, "go", lambda self, *when: None)  # training itself has tests of its own
+    monkeypatch.setattr(trainer.Trainer, "fit", lambda self, *arguments: None)  # training itself has tests of its own
     monkeypatch.setenv("IDESPLAT_RUN_LIMIT", "20")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path.parent / f"{tmp_path.name}-cache"))
     threads = torch.get_num_threads()

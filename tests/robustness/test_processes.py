@@ -91,13 +91,13 @@ def test_no_code_of_the_current_folder_runs_in_benchmarks(tmp_path):
 TRAINING = """
 from pathlib import Path
 
-from idesplat.tools.training.parallel import other_processes
+from idesplat.tools.training.parallel import spawn_workers
 
-def work(team):
+def work(group):
     Path("worked").touch()
 
 if __name__ == "__main__":
-    with other_processes(2, work):
+    with spawn_workers(2, work):
         pass
 """
 

@@ -15,8 +15,8 @@ from ...runtime.errors import InputError
 from ...runtime.system.files import scratch_folder
 
 if TYPE_CHECKING:
-    from ..training.cli import Run
-    from ..training.parallel import Team
+    from ..training.parallel import ProcessGroup
+    from ..training.trainer import Trainer
 
 # The run that the phases are taken of; only the place of a phase in it matters.
 STEPS = 1000
@@ -80,34 +80,35 @@ def _measure(phase: str, candidate: Candidate, steps: int) -> dict[str, Any]:
 
 def _worker(phase: str, candidate: Candidate, steps: int) -> None:
     """What the process of a measurement does; it prints seconds, CPU seconds of all processes, scenes and shares."""
-    from ..training.parallel import Team, spawn_workers
+    from ..training.parallel import ProcessGroup, spawn_workers
 
     with scratch_folder() as folder:
-        run = _run_at(folder, phase, candidate, Team(0, candidate.processes))
+        run = _run_at(folder, phase, candidate, ProcessGroup(0, candidate.processes))
         with spawn_workers(candidate.processes, _other, folder, phase, candidate, steps):
             print(json.dumps(_timed_steps(run, steps)))
 
 
-def _other(team: "Team", folder: Path, phase: str, candidate: Candidate, steps: int) -> None:
-    _timed_steps(_run_at(folder, phase, candidate, team), steps)
+def _other(group: "ProcessGroup", folder: Path, phase: str, candidate: Candidate, steps: int) -> None:
+    _timed_steps(_run_at(folder, phase, candidate, group), steps)
 
 
-def _run_at(folder: Path, phase: str, candidate: Candidate, team: "Team") -> "Run":
+def _run_at(folder: Path, phase: str, candidate: Candidate, group: "ProcessGroup") -> "Trainer":
     """A new run that stands at the beginning of a phase."""
-    from ..training.cli import Run, Settings, _config
+    from ..training.settings import TrainingSettings, network_config
+    from ..training.trainer import Trainer
 
-    settings = Settings(
+    settings = TrainingSettings(
         *(candidate.preset, "both", True, STEPS, candidate.batch, SIZE, 1e-3, 5e-4, 0, "", []),
         precision=candidate.precision,
     )
-    run = Run(folder, settings, _config(settings), team=team)
+    run = Trainer(folder, settings, network_config(settings), group=group)
     run.state.step = PHASES[phase]
     return run
 
 
-def _timed_steps(run: "Run", steps: int) -> dict[str, Any]:
+def _timed_steps(run: "Trainer", steps: int) -> dict[str, Any]:
     """Make some steps after the warm-up; CPU seconds are summed over the team."""
-    from ..training.scenes import prefetch
+    from ..training.data.samples import prefetch
 
     scenes = prefetch(run.specs(), run.task.load)
     for _ in range(WARM_UP):
@@ -118,14 +119,14 @@ def _timed_steps(run: "Run", steps: int) -> dict[str, Any]:
         run.train_step(_timed(scenes, parts))
     seconds, cpu = time.perf_counter() - started, time.process_time() - cpu
     scenes.close()
-    total_cpu = sum(entry["cpu"] for entry in run.team.gather([{"cpu": cpu}]))
+    total_cpu = sum(entry["cpu"] for entry in run.group.gather([{"cpu": cpu}]))
     parts["rendering and losses"] -= sum(parts[name] for name, _ in run.state.model.named_children())
     parts["backward"] = seconds - sum(parts.values())
     shares = {name: part / seconds for name, part in sorted(parts.items(), key=lambda item: -item[1])}
     return {"seconds": seconds, "cpu": total_cpu, "scenes": steps * run.settings.batch, "parts": shares}
 
 
-def _timed_parts(run: "Run") -> dict[str, float]:
+def _timed_parts(run: "Trainer") -> dict[str, float]:
     """Seconds by part of a step from now on: the network's forward stages, losses, exchange and optimiser."""
     parts: dict[str, float] = defaultdict(float)
 
@@ -142,7 +143,7 @@ def _timed_parts(run: "Run") -> dict[str, float]:
         stage.forward = timed(name, stage.forward)
     changed: Any = run  # methods of single objects are replaced
     changed.task.loss = timed("rendering and losses", run.task.loss)
-    changed.team.all_reduce_gradients = timed("waiting and exchange", run.team.all_reduce_gradients)
+    changed.group.all_reduce_gradients = timed("waiting and exchange", run.group.all_reduce_gradients)
     changed.state.update = timed("optimiser", run.state.update)
     return parts
 

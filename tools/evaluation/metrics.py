@@ -79,7 +79,7 @@ def load_lpips() -> LPIPS:
     try:
         import torch
 
-        from ..training.losses import load_lpips_network
+        from ..training.perceptual import load_lpips_network
     except ImportError as error:
         raise InputError(f"LPIPS is left out, since the package {error.name} is not installed") from None
     network = load_lpips_network()

@@ -39,20 +39,20 @@ class Builder:
     """Collects solids and materials; `yaw` and `place` move what is added, so that furniture has a frame of its own."""
 
     rng: np.random.Generator
-    bank: Textures
+    textures: Textures
     yaw: float = 0.0
     place: tuple[float, float, float] = (0.0, 0.0, 0.0)
     solids: list[tuple[int, np.ndarray, np.ndarray, np.ndarray, tuple[int, ...]]] = field(default_factory=list)
     materials: list[tuple[int, np.ndarray, np.ndarray, float, float]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.photos = self.bank.of_kind(PHOTO_KIND)
+        self.photos = self.textures.of_kind(PHOTO_KIND)
 
     def material(self, *kinds: str, period: float | None = None, glow: float = 0.0) -> int:
         """Add a material with a texture of one of `kinds`, recoloured; `period`: its size in metres."""
         rng = self.rng
         kind = kinds[rng.integers(len(kinds))]
-        choices = self.photos if self.photos and rng.random() < PHOTO_PROBABILITY else self.bank.of_kind(kind)
+        choices = self.photos if self.photos and rng.random() < PHOTO_PROBABILITY else self.textures.of_kind(kind)
         texture = choices[rng.integers(len(choices))]
         frequency = 1 / (period or np.exp(rng.uniform(np.log(0.3), np.log(2.0))))
         turn = rng.integers(4) * np.pi / 2 if rng.random() < 0.85 else rng.uniform(0, 2 * np.pi)
@@ -115,10 +115,10 @@ class Builder:
         )
 
 
-def generate_layout(rng: np.random.Generator, bank: Textures, outdoors: bool = False) -> Layout:
+def generate_layout(rng: np.random.Generator, textures: Textures, outdoors: bool = False) -> Layout:
     """A scene of a random kind; outdoors: with those kinds that are seen from outside, from above or all around."""
     layouts = LAYOUTS + OUTDOOR_LAYOUTS if outdoors else LAYOUTS
-    return layouts[rng.integers(len(layouts))](rng, bank)
+    return layouts[rng.integers(len(layouts))](rng, textures)
 
 
 def _open_ground(build: Builder, *ground_kinds: str) -> float:
@@ -140,9 +140,9 @@ def _sunlight(build: Builder) -> Scene:
     return build.scene(lights, rng.uniform(0.35, 0.55) * _tone(rng))
 
 
-def furnished_room(rng: np.random.Generator, bank: Textures) -> Layout:
+def furnished_room(rng: np.random.Generator, textures: Textures) -> Layout:
     """A room with furniture along the walls and in the middle, pictures, a lamp."""
-    build = Builder(rng, bank)
+    build = Builder(rng, textures)
     width, height, length = _room(build)
     for wall in range(4):
         _furnish_wall(build, wall, width, height, length)
@@ -161,9 +161,9 @@ def furnished_room(rng: np.random.Generator, bank: Textures) -> Layout:
     return Layout(_indoor_light(build, width, height, length), eyes, focus)
 
 
-def _clutter(rng: np.random.Generator, bank: Textures) -> Layout:
+def _clutter(rng: np.random.Generator, textures: Textures) -> Layout:
     """A room full of solids in the air, of any shape, size and turn."""
-    build = Builder(rng, bank)
+    build = Builder(rng, textures)
     width, height, length = _room(build, rng.uniform(0.8, 1.6))
     for _ in range(rng.integers(8, 26)):
         centre = tuple(rng.uniform(-0.5, 0.5, 3) * (width, height, length) - (0, height / 2, 0))
@@ -177,9 +177,9 @@ def _clutter(rng: np.random.Generator, bank: Textures) -> Layout:
     return Layout(_indoor_light(build, width, height, length), eyes, 0.6 * eyes + 0.4 * eyes.mean(axis=0))
 
 
-def _street(rng: np.random.Generator, bank: Textures) -> Layout:
+def _street(rng: np.random.Generator, textures: Textures) -> Layout:
     """Open ground with buildings, trees, poles and boxes under a far sky."""
-    build = Builder(rng, bank)
+    build = Builder(rng, textures)
     reach = _open_ground(build, *GROUND_KINDS)
     for _ in range(rng.integers(2, 7)):
         half_x, half_y, half_z = rng.uniform(1, 4), rng.uniform(1.2, 6), rng.uniform(1, 4)
@@ -199,9 +199,9 @@ def _street(rng: np.random.Generator, bank: Textures) -> Layout:
     return Layout(_sunlight(build), eyes, np.array([[-4, -2.0, -4], [4, -0.3, 4]]))
 
 
-def _table_top(rng: np.random.Generator, bank: Textures) -> Layout:
+def _table_top(rng: np.random.Generator, textures: Textures) -> Layout:
     """Small things on a table, seen from nearby."""
-    build = Builder(rng, bank)
+    build = Builder(rng, textures)
     width, height, length = _room(build)
     top = 0.75
     board = build.material(*FLOOR_KINDS, period=rng.uniform(0.4, 1.2))
@@ -217,9 +217,9 @@ def _table_top(rng: np.random.Generator, bank: Textures) -> Layout:
     return Layout(_indoor_light(build, width, height, length), eyes, focus)
 
 
-def _cards(rng: np.random.Generator, bank: Textures) -> Layout:
+def _cards(rng: np.random.Generator, textures: Textures) -> Layout:
     """Flat cards, poles and a slanted wall at many depths before one side: parallax and occlusion, little else."""
-    build = Builder(rng, bank)
+    build = Builder(rng, textures)
     width, height, length = _room(build, rng.uniform(1.0, 1.5))
     wall = build.material(*ANY_KINDS, period=rng.uniform(0.8, 3.0))
     build.yaw = rng.uniform(-0.5, 0.5)
@@ -238,9 +238,9 @@ def _cards(rng: np.random.Generator, bank: Textures) -> Layout:
     return Layout(_indoor_light(build, width, height, length), eyes, focus)
 
 
-def _facade(rng: np.random.Generator, bank: Textures) -> Layout:
+def _facade(rng: np.random.Generator, textures: Textures) -> Layout:
     """The front of a building with windows in recesses, ledges, columns and doors, and what stands before it."""
-    build = Builder(rng, bank)
+    build = Builder(rng, textures)
     _open_ground(build, *GROUND_KINDS)
     wall = build.material("brick", "cells", "plain", "noise", "wood", period=rng.uniform(0.8, 3.0))
     trim, pane = build.material("plain", "noise", "speckle"), build.material("plain", "gradient", "collage")
@@ -263,9 +263,9 @@ def _facade(rng: np.random.Generator, bank: Textures) -> Layout:
     return Layout(_sunlight(build), eyes, focus)
 
 
-def _around_object(rng: np.random.Generator, bank: Textures) -> Layout:
+def _around_object(rng: np.random.Generator, textures: Textures) -> Layout:
     """One object of many solids that run into each other, on the ground or on a stand, seen from close by."""
-    build = Builder(rng, bank)
+    build = Builder(rng, textures)
     outside = rng.random() < 0.5
     size = _room(build) if not outside else None
     if outside:
@@ -294,9 +294,9 @@ def _around_object(rng: np.random.Generator, bank: Textures) -> Layout:
     return Layout(scene, np.stack([eye - spread, eye + spread]), np.stack([focus - spread, focus + spread]))
 
 
-def _from_above(rng: np.random.Generator, bank: Textures) -> Layout:
+def _from_above(rng: np.random.Generator, textures: Textures) -> Layout:
     """Houses, trees and roads, from a drone."""
-    build = Builder(rng, bank)
+    build = Builder(rng, textures)
     _open_ground(build, *GROUND_KINDS)
     for _ in range(rng.integers(1, 4)):
         build.yaw = rng.uniform(0, np.pi)
@@ -321,9 +321,9 @@ def _from_above(rng: np.random.Generator, bank: Textures) -> Layout:
     return Layout(_sunlight(build), eyes, np.array([[-4, -1.0, -4], [4, 0.0, 4]]))
 
 
-def _foliage(rng: np.random.Generator, bank: Textures) -> Layout:
+def _foliage(rng: np.random.Generator, textures: Textures) -> Layout:
     """Bushes and branches: many thin leaves at many depths, before a wall or open ground."""
-    build = Builder(rng, bank)
+    build = Builder(rng, textures)
     _open_ground(build, "strokes", "noise", "cells")
     if rng.random() < 0.5:
         build.box(0, -1.5, 2.5, 5, 1.5, 0.1, build.material(*WALL_KINDS, period=2.0))

@@ -55,15 +55,15 @@ def make_scene(
     files = [images / f"{name}.png" for name in names] + [depths / f"{name}.npz" for name in names]
     outputs().writes("", [*files, cameras])
     rng = np.random.default_rng(seed)
-    bank = scene_textures(seed)
-    layout = furnished_room(rng, bank)
+    textures = scene_textures(seed)
+    layout = furnished_room(rng, textures)
     intrinsics = _intrinsics(width, height)
     scene = layout.scene._replace(light_lengths=np.where(np.arange(len(layout.scene.light_lengths)) == 0, LAMP, -1.0))
     poses = _path(rng, layout, intrinsics, views)
 
     exposure = 1.0
     for index, pose in enumerate(_with_progress(poses)):
-        image, depth = render(scene, bank, pose, intrinsics, height, width, SAMPLES)
+        image, depth = render(scene, textures, pose, intrinsics, height, width, SAMPLES)
         if index == 0:
             exposure = BRIGHTNESS / max(float(image.mean()), 1e-3)
         save_png(images / f"{index:03}.png", exposure * image)

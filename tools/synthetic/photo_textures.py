@@ -40,7 +40,7 @@ def photo_textures(folder: Path) -> Textures:
     return Textures(np.stack(texels), (KIND,) * len(texels))
 
 
-def joined(first: Textures, second: Textures) -> Textures:
+def concatenate(first: Textures, second: Textures) -> Textures:
     """Two banks as one."""
     return Textures(np.concatenate([first.texels, second.texels]), first.kinds + second.kinds)
 

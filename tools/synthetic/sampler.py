@@ -74,7 +74,7 @@ def generate_sample(
     width: int,
     samples: int = 4,
     target_zooms: Sequence[int] = (),
-    bank: Textures | None = None,
+    textures: Textures | None = None,
 ) -> Sample:
     """The sample of `seed`: `context` views whose neighbours overlap, and `targets` views between and around them.
 
@@ -85,15 +85,15 @@ def generate_sample(
     """
     rng = np.random.default_rng(seed)
     training = seed in TRAINING_SEEDS
-    bank = bank or scene_textures(seed)
-    layout = generate_layout(rng, bank, outdoors=training)
+    textures = textures or scene_textures(seed)
+    layout = generate_layout(rng, textures, outdoors=training)
     intrinsics = _sample_intrinsics(rng, context + targets, width / height)
     extrinsics = _sample_poses(rng, layout, intrinsics, context, targets)
     for view, zoom in enumerate(target_zooms, start=context):
         if zoom > 1:
             intrinsics[view] = crop_intrinsics(intrinsics[view], zoom, rng.uniform(0, zoom - 1, 2))
     views = [
-        render(layout.scene, bank, pose, k, height, width, samples)
+        render(layout.scene, textures, pose, k, height, width, samples)
         for pose, k in zip(extrinsics, intrinsics, strict=True)
     ]
     depth = np.stack([view_depth for _, view_depth in views])
@@ -117,7 +117,7 @@ def generate_sample(
 
 
 def render(
-    scene: Scene, bank: Textures, pose: np.ndarray, intrinsics: np.ndarray, height: int, width: int, samples: int
+    scene: Scene, textures: Textures, pose: np.ndarray, intrinsics: np.ndarray, height: int, width: int, samples: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Colour [height, width, 3], from 0, 1 for white, and z-depth [height, width] of a scene, both float32.
 
@@ -126,7 +126,7 @@ def render(
     """
     image, depth = np.zeros((height, width, 3), np.float32), np.empty((height, width), np.float32)
     (fx, _, cx), (_, fy, cy) = intrinsics[:2] * [[width], [height]]
-    cast_rays(scene, bank.texels, pose, (fx, fy, cx, cy), _sample_offsets(samples), image, depth)
+    cast_rays(scene, textures.texels, pose, (fx, fy, cx, cy), _sample_offsets(samples), image, depth)
     return image, depth
 
 

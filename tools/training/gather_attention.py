@@ -1,4 +1,4 @@
-"""The sparse products of epipolar attention, compiled for training on a CPU: no gathered features are ever stored."""
+"""Gather attention of epipolar layers for training on a CPU, compiled with numba; it stores no gathered features."""
 
 import functools
 from typing import Any
@@ -16,15 +16,15 @@ _compiled = functools.partial(
 )
 
 
-def with_compiled_products(model: IDESplat) -> IDESplat:
-    """The same network, whose epipolar layers multiply here: the same sums, ten times as fast."""
-    for products in model.modules():
-        if isinstance(products, GatherAttention):
-            products.gathered_dot, products.gathered_weighted_sum = gathered_dot, gathered_weighted_sum
+def use_compiled_gather_attention(model: IDESplat) -> IDESplat:
+    """Replace the gather attention of all epipolar layers by the compiled one: the same sums, ten times as fast."""
+    for module in model.modules():
+        if isinstance(module, GatherAttention):
+            module.gathered_dot, module.gathered_weighted_sum = gathered_dot, gathered_weighted_sum
     return model
 
 
-class _Correlate(torch.autograd.Function):
+class _GatheredDot(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, queries: Tensor, table: Tensor, rows: Tensor) -> Tensor:
         queries, table, rows = queries.contiguous(), table.contiguous(), rows.contiguous()
@@ -38,18 +38,18 @@ class _Correlate(torch.autograd.Function):
         queries, table, rows = ctx.saved_tensors
         gradient = gradients[0].contiguous()
         of_queries, of_table = torch.zeros_like(queries), torch.zeros_like(table)
-        _sum(gradient.numpy(), table.numpy(), rows.numpy(), of_queries.numpy())
-        _spread(gradient.numpy(), queries.numpy(), rows.numpy(), of_table.numpy())
+        _weighted_sum(gradient.numpy(), table.numpy(), rows.numpy(), of_queries.numpy())
+        _scatter_add(gradient.numpy(), queries.numpy(), rows.numpy(), of_table.numpy())
         return of_queries, of_table, None
 
 
-class _Weigh(torch.autograd.Function):
+class _GatheredWeightedSum(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, probability: Tensor, table: Tensor, rows: Tensor) -> Tensor:
         probability, table, rows = probability.contiguous(), table.contiguous(), rows.contiguous()
         ctx.save_for_backward(probability, table, rows)
         total = torch.zeros(rows.shape[0], rows.shape[2], table.shape[1], dtype=table.dtype)
-        _sum(probability.numpy(), table.numpy(), rows.numpy(), total.numpy())
+        _weighted_sum(probability.numpy(), table.numpy(), rows.numpy(), total.numpy())
         return total
 
     @staticmethod
@@ -58,18 +58,18 @@ class _Weigh(torch.autograd.Function):
         gradient = gradients[0].contiguous()
         of_probability, of_table = torch.empty_like(probability), torch.zeros_like(table)
         _dot(gradient.numpy(), table.numpy(), rows.numpy(), of_probability.numpy())
-        _spread(probability.numpy(), gradient.numpy(), rows.numpy(), of_table.numpy())
+        _scatter_add(probability.numpy(), gradient.numpy(), rows.numpy(), of_table.numpy())
         return of_probability, of_table, None
 
 
 def gathered_dot(queries: Tensor, table: Tensor, rows: Tensor) -> Tensor:
-    """As `model.sparse_products.correlate`."""
-    return _Correlate.apply(queries, table, rows)
+    """As `GatherAttention.gathered_dot`."""
+    return _GatheredDot.apply(queries, table, rows)
 
 
 def gathered_weighted_sum(probability: Tensor, table: Tensor, rows: Tensor) -> Tensor:
-    """As `model.sparse_products.weigh`."""
-    return _Weigh.apply(probability, table, rows)
+    """As `GatherAttention.gathered_weighted_sum`."""
+    return _GatheredWeightedSum.apply(probability, table, rows)
 
 
 @_compiled()
@@ -87,7 +87,7 @@ def _dot(pixels: np.ndarray, table: np.ndarray, rows: np.ndarray, out: np.ndarra
 
 
 @_compiled()
-def _sum(weights: np.ndarray, table: np.ndarray, rows: np.ndarray, out: np.ndarray) -> None:
+def _weighted_sum(weights: np.ndarray, table: np.ndarray, rows: np.ndarray, out: np.ndarray) -> None:
     """out[p, i] += weights[p, c, i] * table[rows[p, c, i]], summed over c."""
     pairs, candidates, count = rows.shape
     for p in range(pairs):
@@ -99,7 +99,7 @@ def _sum(weights: np.ndarray, table: np.ndarray, rows: np.ndarray, out: np.ndarr
 
 
 @_compiled()
-def _spread(weights: np.ndarray, pixels: np.ndarray, rows: np.ndarray, out: np.ndarray) -> None:
+def _scatter_add(weights: np.ndarray, pixels: np.ndarray, rows: np.ndarray, out: np.ndarray) -> None:
     """out[rows[p, c, i]] += weights[p, c, i] * pixels[p, i]."""
     pairs, candidates, count = rows.shape
     for p in range(pairs):

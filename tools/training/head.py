@@ -1,4 +1,4 @@
-"""Training of the Gaussian head alone: all before it is frozen, runs once for each scene, and is kept on disk."""
+"""Training of the Gaussian head alone: the frozen part runs once per scene, and its output is cached on disk."""
 
 import hashlib
 import math
@@ -17,47 +17,51 @@ from ...model.idesplat.gaussian_head import HeadInputs
 from ...model.idesplat.network import IDESplat
 from ...runtime.system.files import atomic_write, make_folder
 from ..synthetic.sampler import TRAINING_SEEDS
-from .losses import Perceptual, offset_loss, render_loss
-from .scenes import MAX_TARGET_ZOOM, SampleSpec, Views
-from .step import PHOTOMETRIC_WEIGHT, psnr_of, render_targets, with_input_view
+from .data.samples import SampleSpec, TrainingViews
+from .data.synthetic import MAX_TARGET_ZOOM
+from .losses import offset_prior, photometric_loss
+from .perceptual import Perceptual
+from .step import PHOTOMETRIC_WEIGHT, psnr, render_targets, with_input_view
 
-# The parts of the network that are trained: the focused module with what leads into it, and the head.
+# The trained parts of the network: the Gaussian focused module with its input convolutions, and the head.
 HEAD_PARTS = ("conv_image", "fuse", "focus", "expand", "head1", "head2", "cross_view")
 HEAD_PREFIXES = tuple(f"gaussians.{part}." for part in HEAD_PARTS)
-# Context views of the scenes, and the share of the scenes that have so many.
+# Numbers of context views, and their probabilities.
 VIEW_COUNT_PROBABILITIES = {2: 0.75, 3: 0.15, 4: 0.1}
-# A head whose opacities are all near 1 has no gradient left there. Its mean opacity is set to this, and its scales are
-# raised by this factor, which half transparent Gaussians need to leave no gaps.
+# If the mean opacity is above the first value, the sigmoid is saturated and has no gradient. The mean is then reset to
+# the second value, and scales are multiplied by SCALE_GAIN, so that the more transparent Gaussians leave no gaps.
 SATURATED_OPACITY, START_OPACITY = 0.95, 0.5
 SCALE_GAIN = 1.1
-# Head inputs that are stored in half precision, by the beginnings of their names.
+# Prefixes of the head's inputs that are stored in half precision.
 HALVED = ("features", "context")
-# Scenes from which the means before are taken.
+# Number of scenes over which opacities are averaged.
 RESET_SCENES = 4
 
 
 @dataclass(frozen=True)
 class HeadSample:
-    """A scene and what the frozen part of the network makes of it."""
+    """The views of a scene, and the head's inputs that the frozen part of the network computes from them."""
 
-    views: Views
+    views: TrainingViews
     inputs: HeadInputs
 
 
 class FeatureCache:
-    """Head inputs of scenes, in files that are made when they are first asked for."""
+    """The head's inputs of scenes, in files that are written on first use."""
 
-    def __init__(self, folder: Path, model: IDESplat, source: Callable[[SampleSpec], Views], description: str) -> None:
+    def __init__(
+        self, folder: Path, model: IDESplat, source: Callable[[SampleSpec], TrainingViews], description: str
+    ) -> None:
         """Use the subfolder of `folder` that belongs to the frozen weights of `model` and to the `description`.
 
-        model: it may be trained meanwhile, but for its frozen part. source: makes a scene's views.
-        description: of all that decides what `source` makes of an order.
+        model: its head may change meanwhile. source: gives the views of a sample.
+        description: all settings on which `source` depends.
         """
         self.model, self.source = model, source
         self.folder = make_folder(folder / _digest(model, description))
 
     def load(self, spec: SampleSpec) -> HeadSample:
-        """The sample of an order."""
+        """The sample of a specification."""
         torch.set_flush_denormal(True)  # a setting of each thread
         path = self.folder / f"{spec.seed}-{spec.context}-{'real' if spec.real else 'synthetic'}.pt"
         if not path.exists():
@@ -76,13 +80,13 @@ class FeatureCache:
         return HeadSample(views, model.gaussians.head_inputs(views.images, cameras, encoded, (first, second, third)))
 
 
-def cameras_of(views: Views) -> Cameras:
+def cameras_of(views: TrainingViews) -> Cameras:
     """The context views' cameras."""
     return Cameras(views.extrinsics, views.intrinsics, views.near, views.far)
 
 
 def head_spec(seed: int, index: int, height: int, width: int, real_ratio: float) -> SampleSpec:
-    """The scene of number `index` in the set that a run with `seed` repeats; real_ratio: share of captured scenes."""
+    """Scene number `index` of the set that a run with `seed` repeats. real_ratio: probability of a capture."""
     rng = np.random.default_rng((seed, index))
     context = int(rng.choice(list(VIEW_COUNT_PROBABILITIES), p=list(VIEW_COUNT_PROBABILITIES.values())))
     scene = int(rng.integers(TRAINING_SEEDS.start, TRAINING_SEEDS.stop))
@@ -91,29 +95,29 @@ def head_spec(seed: int, index: int, height: int, width: int, real_ratio: float)
 
 
 def scene_index(seed: int, place: int, scenes: int) -> int:
-    """Which of `scenes` scenes comes at a place of the run: each once an epoch, every epoch in another order."""
+    """The scene at a place of the run: each of `scenes` once per epoch, in an order that differs between epochs."""
     epoch, rest = divmod(place, scenes)
     return int(np.random.default_rng((seed, epoch)).permutation(scenes)[rest])
 
 
 def head_loss(
-    model: IDESplat, sample: HeadSample, turn: int, perceptual: Perceptual | None
+    model: IDESplat, sample: HeadSample, step: int, perceptual: Perceptual | None
 ) -> tuple[Tensor, dict[str, float]]:
-    """The loss of novel views and of one input view, each rendered from all Gaussians; and what is logged of it.
+    """The loss of a sample, and what is logged.
 
-    turn: says which of the input views.
+    Target views and one context view are rendered, that of number `step` modulo their count.
     """
     views = sample.views
     predicted = model.gaussians.predict(views.images, cameras_of(views), sample.inputs)
-    shown = with_input_view(views, turn % len(views.images))
+    shown = with_input_view(views, step % len(views.images))
     rendered = render_targets(predicted.gaussians, shown)
-    photometric = render_loss(rendered, shown.target_images, perceptual)
-    loss = PHOTOMETRIC_WEIGHT * photometric + offset_loss(predicted.raw)
+    photometric = photometric_loss(rendered, shown.target_images, perceptual)
+    loss = PHOTOMETRIC_WEIGHT * photometric + offset_prior(predicted.raw)
     novel, of_input = rendered.detach()[:-1], rendered.detach()[-1:]
     entry = {
         "loss": float(loss.detach()),
-        "psnr": psnr_of(novel, shown.target_images[:-1]),
-        "input_psnr": psnr_of(of_input, shown.target_images[-1:]),
+        "psnr": psnr(novel, shown.target_images[:-1]),
+        "input_psnr": psnr(of_input, shown.target_images[-1:]),
         "opacity": float(predicted.gaussians.opacities.detach().mean()),
     }
     return loss, entry
@@ -121,7 +125,7 @@ def head_loss(
 
 @torch.no_grad()
 def reset_opacity(model: IDESplat, samples: Iterable[HeadSample]) -> None:
-    """Shift the head's biases so that opacity is START_OPACITY in the mean, if it is saturated, and scales fit it."""
+    """If opacities are saturated, shift the head's biases so that their mean is START_OPACITY, and scales grow."""
     parameters = []
     for sample in samples:
         raw = model.gaussians.predict(sample.views.images, cameras_of(sample.views), sample.inputs).raw
@@ -138,7 +142,7 @@ def reset_opacity(model: IDESplat, samples: Iterable[HeadSample]) -> None:
 
 
 def _digest(model: IDESplat, description: str) -> str:
-    """A folder's name for the frozen weights and a description."""
+    """A folder name that identifies the frozen weights and a description."""
     digest = hashlib.sha256(description.encode())
     for name, value in model.state_dict().items():
         if not name.startswith(HEAD_PREFIXES):
@@ -147,11 +151,11 @@ def _digest(model: IDESplat, description: str) -> str:
 
 
 def _packed(sample: HeadSample) -> dict[str, Tensor]:
-    """A sample as tensors by name, images as bytes and features in half precision."""
-    views = {field.name: getattr(sample.views, field.name) for field in fields(Views)}
+    """A sample as tensors by name: images as uint8, features in half precision."""
+    views = {field.name: getattr(sample.views, field.name) for field in fields(TrainingViews)}
     for name in ("images", "target_images"):
         views[name] = (views[name] * 255).round().to(torch.uint8)
-    del views["inverse_depth"]  # the truth, which the head's losses do not use
+    del views["inverse_depth"]  # the head's loss does not use it
     inputs = sample.inputs._asdict()
     return {**views, **{name: value.half() if name.startswith(HALVED) else value for name, value in inputs.items()}}
 
@@ -164,4 +168,4 @@ def _unpacked(packed: dict[str, Tensor]) -> HeadSample:
     inputs = HeadInputs(**{name: _unhalved(packed.pop(name)) for name in HeadInputs._fields})
     for name in ("images", "target_images"):
         packed[name] = packed[name].float() / 255
-    return HeadSample(Views(**packed, inverse_depth=None), inputs)
+    return HeadSample(TrainingViews(**packed, inverse_depth=None), inputs)

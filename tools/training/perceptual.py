@@ -1,25 +1,67 @@
-"""A perceptual distance on the features of EfficientNet-Lite0, where LPIPS's own weights are not at hand."""
+"""Perceptual distances between rendered and true images: LPIPS, and one on the features of EfficientNet-Lite0."""
 
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from ...model.idesplat.efficientnet import EfficientNetLite0
-from .initialization import load_photographic_weights
+from ...runtime.errors import InputError
+from .initialization import load_imagenet_weights
 
-# Of the network's maps, those at strides 2, 4 and 8.
+# Images [n, 3, H, W] in [0, 1], rendered and true -> their mean distance, a scalar.
+Perceptual = Callable[[Tensor, Tensor], Tensor]
+
+# The file in which torchvision keeps VGG16's ImageNet weights, the backbone of LPIPS.
+VGG_WEIGHTS = "vgg16-397923af.pth"
+# Of EfficientNet-Lite0's feature maps, those at strides 2, 4 and 8.
 LEVELS = slice(0, 3)
 
 
-class PhotographicDistance:
-    """As LPIPS without learnt weights: squared differences of unit-length features, averaged over maps and pixels."""
+def check_lpips() -> None:
+    """Raise InputError if the package lpips, or VGG16's weights in torchvision's cache folder, are missing."""
+    try:
+        import lpips  # noqa: F401
+    except ImportError:
+        raise InputError("LPIPS is left out, since the package lpips is not installed") from None
+    weights = Path(torch.hub.get_dir()) / "checkpoints" / VGG_WEIGHTS
+    if not weights.is_file():
+        raise InputError(f"LPIPS is left out, since VGG16's weights are not at {weights}")
+
+
+def load_lpips_network() -> Any:
+    """LPIPS with VGG16 (Zhang et al. 2018) of the package lpips, with frozen weights; nothing is downloaded.
+
+    Raises InputError as `check_lpips`.
+    """
+    check_lpips()
+    import lpips
+
+    return lpips.LPIPS(net="vgg", verbose=False).requires_grad_(False)
+
+
+def load_lpips() -> Perceptual:
+    """The mean LPIPS of images; raises InputError as `check_lpips`."""
+    network = load_lpips_network()
+    return lambda rendered, truth: network(rendered, truth, normalize=True).mean()
+
+
+class EfficientNetDistance:
+    """LPIPS without learned weights, on the ImageNet features of EfficientNet-Lite0.
+
+    d(a, b) = mean over levels and pixels of |f(a) / |f(a)| - f(b) / |f(b)||^2, with feature vectors f of a pixel.
+    """
 
     def __init__(self) -> None:
         """Load the network; raises InputError if the package with its weights is not installed."""
         self.network = EfficientNetLite0().requires_grad_(False)
-        load_photographic_weights(self.network)
+        load_imagenet_weights(self.network)
 
     def __call__(self, rendered: Tensor, truth: Tensor) -> Tensor:
-        """Images [n, 3, H, W] in [0, 1], multiples of 16 pixels -> their mean distance, a scalar."""
+        """Images [n, 3, H, W] in [0, 1], sides multiples of 16 pixels -> their mean distance, a scalar."""
         pairs = zip(self.network(rendered)[LEVELS], self.network(truth)[LEVELS], strict=True)
         distances = [squared_distance(found, wanted) for found, wanted in pairs]
         return sum(distances[1:], distances[0]) / len(distances)

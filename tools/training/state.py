@@ -1,4 +1,4 @@
-"""All that a training run must remember: weights, their running mean, the optimiser, the step; saved whole or not."""
+"""The state of a training run: weights, their exponential moving average (EMA), optimiser and step."""
 
 import math
 from pathlib import Path
@@ -13,49 +13,49 @@ from ...model.idesplat.config import IDESplatConfig
 from ...model.idesplat.network import IDESplat
 from ...runtime.errors import InputError
 from ...runtime.system.files import atomic_write, check_regular
-from .gather_attention import with_compiled_products
+from .gather_attention import use_compiled_gather_attention
 from .initialization import new_model
 
-# The running mean forgets at this rate, and faster in the beginning.
+# EMA of the weights w at step n: ema <- d ema + (1 - d) w with d = min(EMA_DECAY, n / (n + EMA_START)).
 EMA_DECAY = 0.99
 EMA_START = 10
 WEIGHT_DECAY = 0.01
-LARGEST_GRADIENT = 1.0
-# The optimiser's groups, in this order.
-BACKBONE_PREFIX = "encoder.vit."
-# Weights that were trained on photographs elsewhere, and stay as they are.
+MAX_GRADIENT_NORM = 1.0
+# The ViT's parameters have a learning rate of their own.
+VIT_PREFIX = "encoder.vit."
+# The branch with ImageNet weights, which stay frozen.
 FROZEN_PREFIX = "encoder.photo.network."
-# Settings that earlier versions wrote under another name.
+# Settings that checkpoints of earlier versions have under another name.
 RENAMED_SETTINGS = {"gradual": "curriculum"}
-# A part that older checkpoints lack. As it is made, it changes nothing.
+# A part that older checkpoints lack; newly initialised, it is an identity.
 OPTIONAL_PREFIX = "gaussians.cross_view."
 
 
 class TrainingState:
-    """The network in training. `step` counts the steps done."""
+    """The network in training. step: the number of steps done."""
 
     def __init__(
         self, config: IDESplatConfig, seed: int, lr: float, vit_lr: float, trained: tuple[str, ...] = ("",)
     ) -> None:
-        """A new network drawn from `seed`; learning rates at their highest, the ViT's and that of the rest.
+        """A new network, with random weights of `seed`. lr, vit_lr: highest learning rates.
 
-        trained: the beginnings of the names of the parameters that are trained; all others are frozen.
+        trained: prefixes of the names of the trained parameters; the others are frozen.
         """
-        self.model = with_compiled_products(new_model(config, seed))
+        self.model = use_compiled_gather_attention(new_model(config, seed))
         self.ema = {name: value.clone() for name, value in self.model.state_dict().items()}
         self.step = 0
         for name, parameter in self.model.named_parameters():
             parameter.requires_grad_(name.startswith(trained) and not name.startswith(FROZEN_PREFIX))
         parameters = [(name, p) for name, p in self.model.named_parameters() if p.requires_grad]
         groups = [
-            {"params": [p for name, p in parameters if not name.startswith(BACKBONE_PREFIX)], "highest": lr},
-            {"params": [p for name, p in parameters if name.startswith(BACKBONE_PREFIX)], "highest": vit_lr},
+            {"params": [p for name, p in parameters if not name.startswith(VIT_PREFIX)], "highest": lr},
+            {"params": [p for name, p in parameters if name.startswith(VIT_PREFIX)], "highest": vit_lr},
         ]
         groups = [group for group in groups if group["params"]]
         self.optimizer = torch.optim.AdamW(groups, lr=lr, weight_decay=WEIGHT_DECAY, fused=True)
 
     def start_from(self, path: Path) -> None:
-        """Take the weights of a checkpoint, released or own; raises InputError if it does not fit the network."""
+        """Load the weights of a checkpoint, released or own; raises InputError if it does not fit the network."""
         try:
             tensors = read_state_dict(path)
             made = self.model.state_dict()
@@ -65,17 +65,17 @@ class TrainingState:
         self.reset_ema()
 
     def reset_ema(self) -> None:
-        """Start the running mean anew, with the weights as they are."""
+        """Restart the EMA from the current weights."""
         self.ema = {name: value.clone() for name, value in self.model.state_dict().items()}
 
     def update(self, lr_factor: float) -> float:
         """Make an optimiser step at `lr_factor` times the highest learning rates; returns the gradient's norm.
 
-        A step whose gradient is not finite leaves the weights as they are.
+        A step whose gradient is not finite leaves the weights unchanged.
         """
         for group in self.optimizer.param_groups:
             group["lr"] = lr_factor * group["highest"]
-        norm = float(nn.utils.clip_grad_norm_(self.model.parameters(), LARGEST_GRADIENT))
+        norm = float(nn.utils.clip_grad_norm_(self.model.parameters(), MAX_GRADIENT_NORM))
         if math.isfinite(norm):
             self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
@@ -86,13 +86,13 @@ class TrainingState:
         return norm
 
     def ema_model(self) -> IDESplat:
-        """The network with the running mean of the weights, which predicts better than the last weights."""
-        model = with_compiled_products(IDESplat(self.model.config).eval())
+        """The network with the EMA of the weights, which predicts better than the last weights."""
+        model = use_compiled_gather_attention(IDESplat(self.model.config).eval())
         model.load_state_dict(self.ema)
         return model
 
     def save(self, path: Path, settings: dict[str, Any]) -> None:
-        """Write a checkpoint whose `state_dict` is the mean, as the exporter reads it, beside what resuming needs."""
+        """Write a checkpoint: the EMA as `state_dict`, which the exporter reads, and under `training` the rest."""
         content = {
             "state_dict": self.ema,
             "training": {
@@ -106,12 +106,12 @@ class TrainingState:
             torch.save(content, temporary)
 
     def resume(self, path: Path, settings: dict[str, Any]) -> None:
-        """Go on from a checkpoint of the same run; raises InputError for one of another run or none at all."""
+        """Resume from a checkpoint of the same run; raises InputError if it is of another run, or no checkpoint."""
         check_regular(path)
         try:
             content = torch.load(path, weights_only=True)
             training: dict[str, Any] = content["training"]
-        except Exception as error:  # torch raises whatever it meets inside of a file that is not a checkpoint
+        except Exception as error:  # torch.load raises errors of many types for other files
             reason = (str(error).splitlines() or [type(error).__name__])[0]
             raise InputError(f"{path}: not a checkpoint of a training run ({reason}); choose another --out") from None
         before = {RENAMED_SETTINGS.get(name, name): value for name, value in training["settings"].items()}

@@ -1,4 +1,4 @@
-"""What a training run trains: the whole network, phase by phase, or the Gaussian head alone on cached features."""
+"""Training tasks: the full network, phase by phase, or the Gaussian head alone on cached features."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -7,6 +7,8 @@ from typing import Generic, TypeVar
 from torch import Tensor
 
 from ...model.idesplat.network import IDESplat
+from .data.samples import SampleSpec, TrainingViews
+from .data.synthetic import training_spec
 from .head import (
     HEAD_PREFIXES,
     RESET_SCENES,
@@ -17,41 +19,41 @@ from .head import (
     reset_opacity,
     scene_index,
 )
-from .losses import Perceptual
-from .scenes import SampleSpec, Views, training_spec
-from .schedule import Objective, Phase, training_phases
+from .options import Objective
+from .perceptual import Perceptual
+from .schedule import Phase, training_phases
 from .step import scene_loss
 
-Source = Callable[[SampleSpec], Views]
+Source = Callable[[SampleSpec], TrainingViews]
 Sample = TypeVar("Sample")
 Losses = tuple[Tensor, dict[str, float]]
 
 
 class TrainingTask(ABC, Generic[Sample]):
-    """Which scenes a step has, and the loss of each. Subclasses say which parameters are trained."""
+    """The samples of a step, the loss of each, and which parameters are trained."""
 
-    # The beginnings of the names of the trained parameters; the empty one is that of all.
+    # Prefixes of the names of the trained parameters; the empty prefix is that of all.
     trained: tuple[str, ...] = ("",)
     phases: tuple[Phase, ...]
 
     @abstractmethod
     def spec(self, step: int, slot: int, phase: Phase) -> SampleSpec:
-        """The scene at place `slot` of a step's batch."""
+        """The sample at place `slot` of a step's batch."""
 
     @abstractmethod
     def load(self, spec: SampleSpec) -> Sample:
-        """The scene of an order; it runs beside `loss`, in another thread."""
+        """Load a sample; called in a background thread."""
 
     @abstractmethod
     def loss(self, model: IDESplat, sample: Sample, step: int, phase: Phase) -> Losses:
-        """The loss of a scene, and what is logged of it."""
+        """The loss of a sample, and what is logged."""
 
     def prepare(self, model: IDESplat) -> None:
-        """Change the weights that a new run starts from."""
+        """Adapt the weights that a new run starts from."""
 
 
-class FullNetworkTask(TrainingTask[Views]):
-    """All of the network, in phases."""
+class FullNetworkTask(TrainingTask[TrainingViews]):
+    """All parts of the network, in phases."""
 
     def __init__(
         self,
@@ -63,27 +65,27 @@ class FullNetworkTask(TrainingTask[Views]):
         real_ratio: float,
         perceptual: Perceptual | None,
     ) -> None:
-        """size: images' side in the last phase, pixels. real_ratio: share of the scenes that are captures."""
+        """size: side of the images in the last phase, in pixels. real_ratio: probability of a capture."""
         self.phases, self.objective, self.perceptual = phases, objective, perceptual
         self.seed, self.size, self.source, self.real_ratio = seed, size, source, real_ratio
 
     def spec(self, step: int, slot: int, phase: Phase) -> SampleSpec:
-        """As `training_spec`; captures only where novel views are rendered, since they have no true depth."""
-        side = self.size // phase.shrink
+        """As `training_spec`; captures only in phases that render, since they have no true depth."""
+        side = self.size // phase.downsample
         ratio = self.real_ratio if phase.gaussians else 0.0
-        return training_spec(self.seed, step, slot, phase.gaussians, side, side, phase.units > 1, ratio)
+        return training_spec(self.seed, step, slot, phase.gaussians, side, side, phase.dpbus > 1, ratio)
 
-    def load(self, spec: SampleSpec) -> Views:
-        """The scene's views."""
+    def load(self, spec: SampleSpec) -> TrainingViews:
+        """The views of a sample."""
         return self.source(spec)
 
-    def loss(self, model: IDESplat, sample: Views, step: int, phase: Phase) -> Losses:
+    def loss(self, model: IDESplat, sample: TrainingViews, step: int, phase: Phase) -> Losses:
         """As `scene_loss`."""
         return scene_loss(model, sample, phase, self.objective, self.perceptual, step)
 
 
 class HeadTask(TrainingTask[HeadSample]):
-    """The Gaussian head alone, on a set of scenes that is repeated."""
+    """The Gaussian head alone, on a fixed set of scenes that is repeated every epoch."""
 
     trained = HEAD_PREFIXES
     phases = training_phases(Objective.PHOTOMETRIC, curriculum=False)
@@ -98,17 +100,17 @@ class HeadTask(TrainingTask[HeadSample]):
         real_ratio: float,
         perceptual: Perceptual | None,
     ) -> None:
-        """size: images' side, pixels. scenes: how many different ones. real_ratio: share of captures among them."""
+        """size: side of the images, in pixels. scenes: their number. real_ratio: probability of a capture."""
         self.cache, self.perceptual = cache, perceptual
         self.seed, self.size, self.batch, self.scenes, self.real_ratio = seed, size, batch, scenes, real_ratio
 
     def spec(self, step: int, slot: int, phase: Phase) -> SampleSpec:
-        """Every scene once an epoch."""
+        """Every scene once per epoch, in random order."""
         index = scene_index(self.seed, step * self.batch + slot, self.scenes)
         return head_spec(self.seed, index, self.size, self.size, self.real_ratio)
 
     def load(self, spec: SampleSpec) -> HeadSample:
-        """The scene's cached features."""
+        """The cached features of a sample."""
         return self.cache.load(spec)
 
     def loss(self, model: IDESplat, sample: HeadSample, step: int, phase: Phase) -> Losses:

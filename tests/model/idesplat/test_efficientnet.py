@@ -11,7 +11,7 @@ from idesplat.model.idesplat.network import IDESplat
 from idesplat.model.registry import PRESETS
 from idesplat.runtime.errors import InputError
 from idesplat.tools.training import initialization as initialisation
-from idesplat.tools.training.initialization import load_photographic_weights, new_model
+from idesplat.tools.training.initialization import load_imagenet_weights, new_model
 from idesplat.tools.training.state import FROZEN_PREFIX, TrainingState
 
 LITE = PRESETS["idesplat-lite"]
@@ -32,7 +32,7 @@ def ramps(side: int) -> torch.Tensor:
 
 def test_maps_are_those_of_the_published_network() -> None:
     network = EfficientNetLite0()
-    load_photographic_weights(network)
+    load_imagenet_weights(network)
     with torch.no_grad():
         maps = network(ramps(224))
     for found, stride, channels, (mean, values) in zip(maps, STRIDES, CHANNELS, REFERENCE, strict=True):
@@ -56,7 +56,7 @@ def test_lite_preset_keeps_to_its_size() -> None:
 def test_new_network_has_the_published_weights_and_keeps_them() -> None:
     state = TrainingState(LITE, seed=0, lr=1e-3, vit_lr=1e-3)
     network = EfficientNetLite0()
-    load_photographic_weights(network)
+    load_imagenet_weights(network)
     frozen = {name: value for name, value in state.model.named_parameters() if name.startswith(FROZEN_PREFIX)}
     assert all(torch.equal(frozen[FROZEN_PREFIX + name], value) for name, value in network.named_parameters())
     assert not any(value.requires_grad for value in frozen.values())

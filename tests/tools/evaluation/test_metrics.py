@@ -8,7 +8,7 @@ import pytest
 from idesplat.runtime.errors import InputError
 from idesplat.tools.evaluation import metrics
 from idesplat.tools.evaluation.metrics import depth_measures, load_lpips, psnr, ssim
-from idesplat.tools.training import losses
+from idesplat.tools.training import perceptual
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch import Tensor
 
@@ -98,7 +98,7 @@ def test_lpips_sees_images_whose_invalid_pixels_are_true(monkeypatch: pytest.Mon
         assert normalize and x.shape == y.shape == (1, 3, 4, 5)
         return (x - y).abs().sum()
 
-    monkeypatch.setattr(losses, "load_lpips_network", lambda: network)
+    monkeypatch.setattr(perceptual, "load_lpips_network", lambda: network)
     lpips = load_lpips()
     truth = np.zeros((4, 5, 3))
     valid = np.ones((4, 5), bool)

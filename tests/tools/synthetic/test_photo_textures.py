@@ -10,7 +10,8 @@ from idesplat.tools.synthetic.layout import LAYOUTS, OUTDOOR_LAYOUTS, Builder
 from idesplat.tools.synthetic.photo_textures import KIND, photo_textures
 from idesplat.tools.synthetic.sampler import TRAINING_SEEDS, VALIDATION_SEEDS
 from idesplat.tools.synthetic.textures import SIZE, texture_bank
-from idesplat.tools.training.scenes import SampleSpec, generate_views
+from idesplat.tools.training.data.samples import SampleSpec
+from idesplat.tools.training.data.synthetic import generate_views
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,9 @@ import pytest
 import torch
 from idesplat.model.common.gaussian_adapter import SCALE_SHIFT
 from idesplat.runtime.errors import EXIT_STATUS
-from idesplat.tools.training import cli as train
 from idesplat.tools.training import head as head_training
-from idesplat.tools.training.cli import CHECKPOINT, FEATURES, Run
+from idesplat.tools.training.data.samples import SampleSpec, TrainingViews
+from idesplat.tools.training.data.synthetic import generate_views
 from idesplat.tools.training.head import (
     HEAD_PREFIXES,
     SCALE_GAIN,
@@ -23,8 +23,9 @@ from idesplat.tools.training.head import (
     scene_index,
 )
 from idesplat.tools.training.initialization import new_model
-from idesplat.tools.training.scenes import SampleSpec, Views, generate_views
-from idesplat.tools.training.schedule import Part
+from idesplat.tools.training.options import Part
+from idesplat.tools.training.run_files import CHECKPOINT, FEATURES
+from idesplat.tools.training.trainer import Trainer
 from test_train import SETTINGS, SMALL, finished, logged, one_thread, refused
 
 __all__ = ["finished", "one_thread"]  # fixtures
@@ -63,13 +64,13 @@ def test_features_are_computed_once_and_give_the_same_gaussians(cache: FeatureCa
     assert torch.equal(cached.depth, whole.depth)
     assert (cached.raw - whole.raw).abs().max() < 0.05 * whole.raw.std()
 
-    def fail(_: SampleSpec) -> Views:
-        raise AssertionError("drawn again")
+    def fail(_: SampleSpec) -> TrainingViews:
+        raise AssertionError("loaded again")
 
     again = FeatureCache(cache.folder.parent, cache.model, fail, "test").load(spec)
     assert torch.equal(again.inputs.context, sample.inputs.context)
     other = FeatureCache(cache.folder.parent, new_model(CONFIG, seed=1), fail, "test")
-    with pytest.raises(AssertionError, match="drawn again"):  # features of other weights are others
+    with pytest.raises(AssertionError, match="loaded again"):  # features of other weights are others
         other.load(spec)
 
 
@@ -107,28 +108,27 @@ def test_only_the_head_gets_gradients(cache: FeatureCache) -> None:
     assert entry["psnr"] > 0 and entry["input_psnr"] > 0 and 0 < entry["opacity"] < 1
 
 
-def test_run_trains_the_head_alone_and_resumes(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_run_trains_the_head_alone_and_resumes(finished: Path, tmp_path: Path) -> None:
     settings = replace(HEAD, init=str(finished / CHECKPOINT))
     whole = tmp_path / "whole"
     whole.mkdir()
-    Run(whole, settings, SMALL).go(save_every=1e9, validate_every=4)
+    Trainer(whole, settings, SMALL).fit(save_every=1e9, validate_every=4)
     before = torch.load(finished / CHECKPOINT, weights_only=True)["state_dict"]
     after = torch.load(whole / CHECKPOINT, weights_only=True)["state_dict"]
     changed = {name for name, value in after.items() if not torch.equal(value, before[name])}
     assert changed and all(name.startswith(HEAD_PREFIXES) for name in changed)
     assert len(list((whole / FEATURES).rglob("*.pt"))) == 3
 
-    def stop(bar: train.Bar, entry: dict[str, float]) -> None:
+    def stop(entry: dict[str, float]) -> None:
         if entry["step"] == 2:
             raise KeyboardInterrupt
 
     parts = tmp_path / "parts"
     parts.mkdir()
-    with monkeypatch.context() as stopped:
-        stopped.setattr(train.Bar, "show", stop)
-        with pytest.raises(KeyboardInterrupt):
-            Run(parts, settings, SMALL, features=whole / FEATURES).go(save_every=0, validate_every=4)
-    Run(parts, settings, SMALL, features=whole / FEATURES).go(save_every=1e9, validate_every=4)
+    with pytest.raises(KeyboardInterrupt):
+        trainer = Trainer(parts, settings, SMALL, features=whole / FEATURES)
+        trainer.fit(save_every=0, validate_every=4, on_step=stop)
+    Trainer(parts, settings, SMALL, features=whole / FEATURES).fit(save_every=1e9, validate_every=4)
     assert logged(parts) == logged(whole)
     assert not (parts / FEATURES).exists()
 

@@ -12,8 +12,10 @@ from pathlib import Path
 import pytest
 import torch
 from idesplat.runtime.errors import InputError
-from idesplat.tools.training.cli import CHECKPOINT, LOG, Run, _work
-from idesplat.tools.training.parallel import Team, mean_entries, spawn_workers
+from idesplat.tools.training import cli
+from idesplat.tools.training.parallel import ProcessGroup, mean_entries
+from idesplat.tools.training.run_files import CHECKPOINT, LOG
+from idesplat.tools.training.trainer import train
 from test_train import SETTINGS, SMALL
 
 TWO_STEPS = replace(SETTINGS, curriculum=False, steps=2, batch=2)
@@ -21,9 +23,7 @@ TWO_STEPS = replace(SETTINGS, curriculum=False, steps=2, batch=2)
 
 def trained(folder: Path, processes: int) -> tuple[dict[str, torch.Tensor], list[dict[str, float]]]:
     folder.mkdir()
-    run = Run(folder, TWO_STEPS, SMALL, team=Team(0, processes))
-    with spawn_workers(processes, _work, folder, TWO_STEPS, SMALL, None, 1, 10):
-        run.go(1e9, 10)
+    train(TWO_STEPS, folder, config=SMALL, processes=processes, save_every=1e9, validate_every=10)
     entries = [json.loads(line) for line in (folder / LOG).read_text().splitlines()]
     return torch.load(folder / CHECKPOINT, weights_only=True)["training"]["weights"], entries
 
@@ -43,9 +43,9 @@ def test_two_processes_make_the_same_steps(tmp_path: Path) -> None:
 
 
 def test_a_share_of_a_batch_leaves_no_scene_out() -> None:
-    shares = [list(Team(rank, 3).share(8)) for rank in range(3)]
+    shares = [list(ProcessGroup(rank, 3).shard(8)) for rank in range(3)]
     assert shares == [[0, 3, 6], [1, 4, 7], [2, 5]]
-    assert list(Team().share(3)) == [0, 1, 2] and Team().leads and not Team(1, 2).leads
+    assert list(ProcessGroup().shard(3)) == [0, 1, 2] and ProcessGroup().is_main and not ProcessGroup(1, 2).is_main
 
 
 def test_figures_are_averaged_over_the_scenes_that_have_them() -> None:
@@ -53,10 +53,8 @@ def test_figures_are_averaged_over_the_scenes_that_have_them() -> None:
 
 
 def test_more_processes_than_scenes_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from idesplat.tools.training.cli import train
-
     with pytest.raises(SystemExit):
-        train(out=tmp_path / "run", batch=1, processes=2)
+        cli.train(out=tmp_path / "run", batch=1, processes=2)
     assert "more than the 1 scenes of a step" in capsys.readouterr().err
 
 
@@ -93,4 +91,4 @@ def test_a_process_that_ends_is_one_line(monkeypatch: pytest.MonkeyPatch) -> Non
 
     monkeypatch.setattr(torch.distributed, "all_gather_object", fail)
     with pytest.raises(InputError, match=r"ended \(Connection closed by peer\); repeat the command"):
-        Team(0, 2).gather([])
+        ProcessGroup(0, 2).gather([])

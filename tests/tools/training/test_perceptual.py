@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from idesplat.tools.training.perceptual import PhotographicDistance, squared_distance
+from idesplat.tools.training.perceptual import EfficientNetDistance, squared_distance
 
 
 def test_distance_of_features_by_hand() -> None:
@@ -17,7 +17,7 @@ def test_distance_of_features_by_hand() -> None:
 
 
 def test_blur_is_farther_than_a_little_more_light() -> None:
-    distance = PhotographicDistance()
+    distance = EfficientNetDistance()
     truth = torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(0))
     blurred = torch.nn.functional.avg_pool2d(truth, 5, stride=1, padding=2, count_include_pad=False)
     brighter = (truth * 1.05).requires_grad_()

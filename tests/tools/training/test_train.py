@@ -24,17 +24,21 @@ from idesplat.runtime.cameras.camera import Camera
 from idesplat.runtime.errors import EXIT_STATUS, InputError
 from idesplat.runtime.views.batch import ViewBatch, build_view_batch
 from idesplat.tools.synthetic.make_scene import make_scene
-from idesplat.tools.training import captures as training_folders
-from idesplat.tools.training import cli as train
-from idesplat.tools.training import losses
-from idesplat.tools.training.captures import FolderScenes
-from idesplat.tools.training.cli import CHECKPOINT, CURVES, LOG, PICTURES, Run, Settings
+from idesplat.tools.training import cli, losses
+from idesplat.tools.training.data import captures
+from idesplat.tools.training.data.captures import CaptureScenes
+from idesplat.tools.training.data.samples import SampleSpec, prefetch
+from idesplat.tools.training.data.synthetic import generate_views, training_spec
 from idesplat.tools.training.initialization import new_model
 from idesplat.tools.training.log import TrainingLog
-from idesplat.tools.training.scenes import SampleSpec, generate_views, prefetch, training_spec
-from idesplat.tools.training.schedule import Objective, Phase, lr_factor, phase_at, training_phases
+from idesplat.tools.training.options import Objective
+from idesplat.tools.training.perceptual import load_lpips
+from idesplat.tools.training.run_files import CHECKPOINT, CURVES, LOG, PREDICTIONS
+from idesplat.tools.training.schedule import Phase, lr_factor, phase_at, training_phases
+from idesplat.tools.training.settings import TrainingSettings
 from idesplat.tools.training.state import TrainingState
 from idesplat.tools.training.step import scene_loss, with_input_view
+from idesplat.tools.training.trainer import Trainer
 
 SMALL = IDESplatConfig(
     backbone_channels=(8, 8, 16),
@@ -52,8 +56,10 @@ SMALL = IDESplatConfig(
     focus=FocusConfig(channels=16, window=4, topk=(16, 16, 8, 8)),
     sh_degree=1,
 )
-EVERYTHING = Phase(1.0, units=3, gaussians=True, shrink=1)
-SETTINGS = Settings("small", "both", True, steps=8, batch=2, size=64, lr=1e-3, vit_lr=5e-4, seed=3, init="", data=[])
+EVERYTHING = Phase(1.0, dpbus=3, gaussians=True, downsample=1)
+SETTINGS = TrainingSettings(
+    "small", "both", True, steps=8, batch=2, size=64, lr=1e-3, vit_lr=5e-4, seed=3, init="", data=[]
+)
 
 
 @pytest.fixture(autouse=True)
@@ -90,17 +96,17 @@ def test_entropy_by_hand() -> None:
     """Three candidates 0, 1, 2, of which the truth 1.25 shares itself between the last two."""
     probability = torch.tensor([0.2, 0.5, 0.3]).reshape(1, 3, 1, 1)
     candidates = torch.tensor([0.0, 1.0, 2.0]).reshape(1, 3, 1, 1)
-    found = losses.entropy_loss(probability, candidates, torch.full((1, 1, 1, 1), 1.25))
+    found = losses.candidate_cross_entropy(probability, candidates, torch.full((1, 1, 1, 1), 1.25))
     assert float(found) == pytest.approx(-0.75 * math.log(0.5) - 0.25 * math.log(0.3))
-    assert losses.entropy_loss(probability, candidates, torch.full((1, 1, 1, 1), 2.5)) == 0  # outside of the candidates
+    assert losses.candidate_cross_entropy(probability, candidates, torch.full((1, 1, 1, 1), 2.5)) == 0  # outside
 
 
 def test_gaussians_are_held_to_the_middle_of_their_pixels_alone() -> None:
     raw = torch.randn(2, 22, 3, 4)
     raw[:, 1:3] = 0.0
-    assert losses.offset_loss(raw) == 0
+    assert losses.offset_prior(raw) == 0
     raw[:, 1] = math.log(3)  # sigmoid 0.75, of x alone
-    assert float(losses.offset_loss(raw)) == pytest.approx(losses.OFFSET_WEIGHT * 0.25 / 2, rel=1e-5)
+    assert float(losses.offset_prior(raw)) == pytest.approx(losses.OFFSET_WEIGHT * 0.25 / 2, rel=1e-5)
 
 
 def test_large_errors_of_an_image_do_not_rule() -> None:
@@ -108,8 +114,8 @@ def test_large_errors_of_an_image_do_not_rule() -> None:
     truth = torch.zeros(2, 3, 4, 4)
     rendered = truth + torch.tensor([0.1, 1.0])[:, None, None, None]
     expected = 0.003 * (math.log(1 + 0.01 / 0.003) + math.log(1 + 1 / 0.003)) / 2
-    assert float(losses.render_loss(rendered, truth, None)) == pytest.approx(expected, rel=1e-5)
-    weighted = losses.render_loss(rendered, truth, lambda a, b: (a - b).mean())
+    assert float(losses.photometric_loss(rendered, truth, None)) == pytest.approx(expected, rel=1e-5)
+    weighted = losses.photometric_loss(rendered, truth, lambda a, b: (a - b).mean())
     assert float(weighted) == pytest.approx(expected + losses.LPIPS_WEIGHT * 0.55, rel=1e-5)
 
 
@@ -132,8 +138,8 @@ def test_monocular_loss_knows_no_scale() -> None:
 
 def test_truth_is_picked_where_corners_lie_on_corners() -> None:
     truth = torch.arange(64.0).reshape(1, 8, 8)
-    assert losses.truth_at(truth, 2, 2).flatten().tolist() == [0, 7, 56, 63]
-    assert torch.equal(losses.truth_at(truth, 8, 8)[:, 0], truth)
+    assert losses.resize_truth(truth, 2, 2).flatten().tolist() == [0, 7, 56, 63]
+    assert torch.equal(losses.resize_truth(truth, 8, 8)[:, 0], truth)
 
 
 def test_new_network_matches_from_the_start() -> None:
@@ -153,23 +159,21 @@ def test_new_network_matches_from_the_start() -> None:
     assert not torch.equal(ours, other.encoder.backbone.conv1.weight)
 
 
-def test_lpips_only_where_it_needs_no_download(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_lpips_only_where_it_needs_no_download(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, "lpips", None)  # not installed
-    assert losses.load_perceptual() is None
-    assert "lpips is not installed" in capsys.readouterr().err
+    with pytest.raises(InputError, match="lpips is not installed"):
+        load_lpips()
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     monkeypatch.setitem(sys.modules, "lpips", SimpleNamespace())
-    assert losses.load_perceptual() is None
-    assert "weights are not at" in capsys.readouterr().err
+    with pytest.raises(InputError, match="weights are not at"):
+        load_lpips()
 
 
-def test_curriculum_and_rates() -> None:
+def test_curriculum_goes_from_coarse_to_fine_and_lr_decays() -> None:
     phases = training_phases(Objective.BOTH, curriculum=True)
     seen = [phase_at(phases, step, 100) for step in range(100)]
-    assert seen[0].units == 1 and seen[-1].units == 3 and seen[-1].gaussians and seen[-1].shrink == 1
-    assert [phase.units for phase in seen] == sorted(phase.units for phase in seen)
+    assert seen[0].dpbus == 1 and seen[-1].dpbus == 3 and seen[-1].gaussians and seen[-1].downsample == 1
+    assert [phase.dpbus for phase in seen] == sorted(phase.dpbus for phase in seen)
     assert not any(phase.gaussians for phase in training_phases(Objective.DEPTH, curriculum=True))
     assert training_phases(Objective.PHOTOMETRIC, curriculum=True) == (EVERYTHING,)
     rates = [lr_factor(phases, step, 1000) for step in range(1000)]
@@ -182,8 +186,8 @@ def test_curriculum_and_rates() -> None:
 
 
 def test_scenes_come_in_order_and_repeat() -> None:
-    specs = [training_spec(5, step, 0, True, 32, 32, many=True) for step in range(120)]
-    assert specs == [training_spec(5, step, 0, True, 32, 32, many=True) for step in range(120)]
+    specs = [training_spec(5, step, 0, True, 32, 32, three_views=True) for step in range(120)]
+    assert specs == [training_spec(5, step, 0, True, 32, 32, three_views=True) for step in range(120)]
     assert len({spec.seed for spec in specs}) == 120 and {spec.context for spec in specs} == {2, 3}
     drawn = list(prefetch(iter(specs[:7]), generate_views))
     for spec, views in zip(specs, drawn, strict=False):
@@ -221,7 +225,7 @@ def logged(folder: Path) -> list[dict[str, float]]:
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("finished")
     torch.set_num_threads(1)
-    Run(folder, SETTINGS, SMALL).go(save_every=1e9, validate_every=4)
+    Trainer(folder, SETTINGS, SMALL).fit(save_every=1e9, validate_every=4)
     return folder
 
 
@@ -231,25 +235,23 @@ def test_writes_all_that_it_says(finished: Path) -> None:
     assert all(entry["loss"] > 0 for entry in entries) and "psnr" in entries[-1]
     assert [entry["step"] for entry in entries if "validation_abs_rel" in entry] == [4, 8]
     assert cv2.imread(str(finished / CURVES)).std() > 5
-    pictures = cv2.imread(str(finished / PICTURES))
+    pictures = cv2.imread(str(finished / PREDICTIONS))
     assert pictures.shape == (4 * 64, 6 * 64, 3) and pictures.std() > 5
 
 
-def test_resumed_run_equals_uninterrupted(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_resumed_run_equals_uninterrupted(finished: Path, tmp_path: Path) -> None:
     """Stopped after step 5 was logged but not saved: it is done again, and nothing differs from then on."""
 
-    def stop(bar: train.Bar, entry: dict[str, float]) -> None:
+    def stop(entry: dict[str, float]) -> None:
         if entry["step"] == 5:
             raise KeyboardInterrupt
 
-    with monkeypatch.context() as stopped:
-        stopped.setattr(train.Bar, "show", stop)
-        with pytest.raises(KeyboardInterrupt):
-            Run(tmp_path, SETTINGS, SMALL).go(save_every=0, validate_every=4)
+    with pytest.raises(KeyboardInterrupt):
+        Trainer(tmp_path, SETTINGS, SMALL).fit(save_every=0, validate_every=4, on_step=stop)
     assert len(logged(tmp_path)) == 5
     with (tmp_path / LOG).open("a") as log:
         log.write('{"step": 6, "lo')  # a line half written
-    Run(tmp_path, SETTINGS, SMALL).go(save_every=1e9, validate_every=4)
+    Trainer(tmp_path, SETTINGS, SMALL).fit(save_every=1e9, validate_every=4)
     assert logged(tmp_path) == logged(finished)
     ours, theirs = (torch.load(folder / CHECKPOINT, weights_only=True) for folder in (tmp_path, finished))
     for name, value in theirs["state_dict"].items():
@@ -323,7 +325,7 @@ def test_log_drops_what_is_done_again(tmp_path: Path) -> None:
 
 def refused(capsys: pytest.CaptureFixture[str], **options: object) -> str:
     with pytest.raises(SystemExit) as stopped:
-        train.train(**options)
+        cli.train(**options)
     assert stopped.value.code == EXIT_STATUS
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1
@@ -350,15 +352,15 @@ def test_bad_inputs_are_one_line_each(finished: Path, tmp_path: Path, capsys: py
 
 def test_photographs_are_trained_on_by_their_views_alone(scene: Path, tmp_path: Path) -> None:
     settings = replace(SETTINGS, objective="photometric", steps=2, data=[str(scene)])
-    Run(tmp_path, settings, SMALL).go(save_every=1e9, validate_every=2)
+    Trainer(tmp_path, settings, SMALL).fit(save_every=1e9, validate_every=2)
     entries = logged(tmp_path)
     assert all(entry["psnr"] > 0 and "abs_rel" not in entry for entry in entries)
     assert entries[-1]["validation_psnr"] > 0
-    assert cv2.imread(str(tmp_path / PICTURES)).shape == (4 * 64, 4 * 64, 3)
+    assert cv2.imread(str(tmp_path / PREDICTIONS)).shape == (4 * 64, 4 * 64, 3)
 
 
 def test_folder_samples_follow_their_spec(scene: Path) -> None:
-    scenes = FolderScenes([scene], near=1, far=20)
+    scenes = CaptureScenes([scene], near=1, far=20)
     spec = SampleSpec(5, 2, (1,), 64, 96)
     first, again = scenes.load(spec), scenes.load(spec)
     assert torch.equal(first.images, again.images) and torch.equal(first.target_images, again.target_images)
@@ -381,7 +383,7 @@ def test_validation_renders_photographs_that_training_never_uses(
     """Of five photographs, the first one is held out."""
     used: dict[str, set[str]] = {"train": set(), "validate": set()}
     now = "train"
-    opened = training_folders.take
+    opened = captures.load_view
 
     def noted(pair: tuple[Path, Camera], height: int, width: int) -> tuple:
         used[now].add(pair[0].name)
@@ -392,10 +394,10 @@ def test_validation_renders_photographs_that_training_never_uses(
             used[now].update(path.name for path, _ in pairs)
         return build_view_batch(pairs, *rest)
 
-    monkeypatch.setattr(training_folders, "take", noted)
-    monkeypatch.setattr(training_folders, "prepare", noted_all)
+    monkeypatch.setattr(captures, "take", noted)
+    monkeypatch.setattr(captures, "prepare", noted_all)
     settings = replace(SETTINGS, objective="photometric", data=[str(scene)])
-    run = Run(tmp_path, settings, SMALL)
+    run = Trainer(tmp_path, settings, SMALL)
     for seed in range(40):
         run.source(SampleSpec(seed, 2, (1, 2), 64, 64))
     now = "validate"
@@ -406,14 +408,14 @@ def test_validation_renders_photographs_that_training_never_uses(
 
 def test_folder_with_too_few_photographs_is_refused(tmp_path: Path) -> None:
     make_scene(tmp_path, seed=2, views=4, height=32, width=48)
-    with pytest.raises(InputError, match="3 photographs to train on and 1 held out for validation, expected at least"):
-        FolderScenes([tmp_path], near=1, far=20)
+    with pytest.raises(InputError, match="3 images to train on and 1 held out for validation, expected at least"):
+        CaptureScenes([tmp_path], near=1, far=20)
 
 
 def test_folder_without_a_photograph_is_refused(scene: Path, tmp_path: Path) -> None:
     shutil.copy(scene / "transforms.json", tmp_path)
     with pytest.raises(InputError, match="which is not there"):
-        FolderScenes([tmp_path], near=1, far=20)
+        CaptureScenes([tmp_path], near=1, far=20)
 
 
 def test_init_takes_weights_and_starts_from_step_zero(finished: Path) -> None:

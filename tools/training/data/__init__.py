@@ -1,0 +1,1 @@
+"""Training data: synthetic scenes and captures, as tensors."""

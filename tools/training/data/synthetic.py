@@ -1,0 +1,71 @@
+"""Training samples of synthetic scenes, with exact depth."""
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ...synthetic.photo_textures import concatenate, photo_textures
+from ...synthetic.sampler import TRAINING_SEEDS, Sample, generate_sample, scene_textures
+from ...synthetic.textures import Textures
+from .samples import SampleSpec, TrainingViews
+
+# Probability of three context views instead of two.
+THREE_VIEW_PROBABILITY = 0.06
+# One target view has the size of the context images; another is a crop of an image up to so many times as large.
+# Gaussians that are only rendered at the context's size leave gaps where a viewer shows them larger.
+MAX_TARGET_ZOOM = 4
+
+
+def training_spec(
+    seed: int, step: int, slot: int, rendered: bool, height: int, width: int, three_views: bool, real_ratio: float = 0.0
+) -> SampleSpec:
+    """The sample at place `slot` of a step's batch, which depends on the run's seed and the step alone.
+
+    rendered: whether it has target views. three_views: whether some samples have three context views.
+    real_ratio: probability of a capture.
+    """
+    rng = np.random.default_rng((seed, step, slot))
+    context = 3 if three_views and rng.random() < THREE_VIEW_PROBABILITY else 2
+    scene = int(rng.integers(TRAINING_SEEDS.start, TRAINING_SEEDS.stop))
+    zooms = (1, int(rng.integers(2, MAX_TARGET_ZOOM + 1))) if rendered else ()
+    return SampleSpec(scene, context, zooms, height, width, real=bool(rng.random() < real_ratio))
+
+
+def generate_views(spec: SampleSpec, photos: Path | None = None) -> TrainingViews:
+    """The synthetic sample of a specification.
+
+    photos: folder of images for the textures of training scenes, in addition to the generated textures.
+    """
+    textures = _with_photos(photos) if photos is not None and spec.seed in TRAINING_SEEDS else None
+    zooms = spec.target_zooms
+    sample = generate_sample(
+        spec.seed, spec.context, len(zooms), spec.height, spec.width, target_zooms=zooms, textures=textures
+    )
+    return to_views(sample)
+
+
+def to_views(sample: Sample) -> TrainingViews:
+    """A synthetic sample as tensors."""
+    count = sample.context
+    images, extrinsics, intrinsics = (
+        torch.from_numpy(part) for part in (sample.images, sample.extrinsics, sample.intrinsics)
+    )
+    return TrainingViews(
+        images[:count],
+        extrinsics[:count],
+        intrinsics[:count],
+        torch.full((count,), sample.near),
+        torch.full((count,), sample.far),
+        1 / torch.from_numpy(sample.depth[:count]),
+        images[count:],
+        extrinsics[count:],
+        intrinsics[count:],
+    )
+
+
+@cache
+def _with_photos(folder: Path) -> Textures:
+    """The generated textures of training scenes, and those of a folder."""
+    return concatenate(scene_textures(TRAINING_SEEDS.start), photo_textures(folder))

@@ -1,0 +1,240 @@
+"""The training loop.
+
+The scenes of a step depend on the run's seed and the step's number alone, so that a resumed run repeats an
+uninterrupted one.
+"""
+
+import ctypes
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ...model.idesplat.config import IDESplatConfig
+from ...model.idesplat.gaussian_head import HeadInputs
+from ...model.idesplat.network import IDESplat
+from ...runtime.errors import InputError
+from ..synthetic.photo_textures import photo_textures
+from .data.captures import CaptureScenes
+from .data.samples import SampleSpec, TrainingViews, prefetch
+from .data.synthetic import generate_views
+from .head import FeatureCache
+from .log import TrainingLog, finite
+from .mixed_precision import with_bfloat16
+from .options import Objective, Part, PerceptualKind, Precision
+from .parallel import ProcessGroup, mean_entries, spawn_workers
+from .perceptual import EfficientNetDistance, Perceptual, load_lpips
+from .plots import write_curves
+from .run_files import CHECKPOINT, CURVES, FEATURES, LOG, PREDICTIONS
+from .schedule import Phase, lr_factor, phase_at
+from .settings import TrainingSettings, network_config
+from .state import TrainingState
+from .tasks import FullNetworkTask, HeadTask, TrainingTask
+from .validation import validate
+
+# Called with what is logged of each step: `step`, `loss` and metrics.
+OnStep = Callable[[dict[str, Any]], None]
+Source = Callable[[SampleSpec], TrainingViews]
+
+PLOTTED = ("loss", "psnr", "input_psnr", "abs_rel", "validation_abs_rel", "validation_psnr", "gradient")
+# glibc returns the memory of every large tensor to the system, which clears it again on the next allocation. These
+# parameters of mallopt make it keep that memory.
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
+MAX_THRESHOLD = 2**31 - 1
+
+
+def train(
+    settings: TrainingSettings,
+    out: Path,
+    *,
+    config: IDESplatConfig | None = None,
+    features: Path | None = None,
+    processes: int = 1,
+    threads: int = 1,
+    save_every: float = 180.0,
+    validate_every: int = 200,
+    on_step: OnStep | None = None,
+) -> None:
+    """Train a network in the folder `out`, or resume the run whose checkpoint is there.
+
+    config: the network's, if not that of the preset. features: folder of cached features, by default one inside `out`.
+    processes: data-parallel processes, at most the batch size. threads: PyTorch's, in each process.
+    save_every: seconds between checkpoints. validate_every: steps between validations. on_step: called after each step.
+
+    Raises InputError for settings that contradict each other, for a checkpoint of another run, and for unusable data.
+    """
+    config = config or network_config(settings)
+    if processes > settings.batch:
+        raise InputError(f"--processes {processes}: more than the {settings.batch} scenes of a step; raise --batch")
+    trainer = Trainer(out, settings, config, features, ProcessGroup(0, processes), threads)
+    with spawn_workers(processes, _work, out, settings, config, features, threads, validate_every):
+        trainer.fit(save_every, validate_every, on_step)
+
+
+def _work(
+    group: ProcessGroup,
+    folder: Path,
+    settings: TrainingSettings,
+    config: IDESplatConfig,
+    features: Path | None,
+    threads: int,
+    validate_every: int,
+) -> None:
+    """The loop of a process other than rank 0."""
+    Trainer(folder, settings, config, features, group, threads).fit(math.inf, validate_every)
+
+
+class Trainer:
+    """A training run in its folder."""
+
+    def __init__(
+        self,
+        folder: Path,
+        settings: TrainingSettings,
+        config: IDESplatConfig,
+        features: Path | None = None,
+        group: ProcessGroup | None = None,
+        threads: int = 1,
+    ) -> None:
+        """Start the run, or resume it from the checkpoint in the folder; raises InputError if that is another run's.
+
+        features: folder of cached features, by default one inside `folder`. group: the processes of the run.
+        threads: PyTorch's, in this process.
+        """
+        _prepare_process(threads)
+        self.folder, self.settings, self.group = folder, settings, group or ProcessGroup()
+        trained = HeadTask.trained if settings.part == Part.HEAD else FullNetworkTask.trained
+        self.state = TrainingState(config, settings.seed, settings.lr, settings.vit_lr, trained)
+        resumed = (folder / CHECKPOINT).exists()
+        if resumed:
+            self.state.resume(folder / CHECKPOINT, asdict(settings))
+        elif settings.init:
+            self.state.start_from(Path(settings.init))
+        self.source, self.held_out = _sources(settings, config)
+        self.task = _task(settings, self.state.model, self.source, features or folder / FEATURES)
+        self.phases = self.task.phases
+        if not resumed:
+            self.task.prepare(self.state.model)
+            self.state.reset_ema()
+        if settings.precision == Precision.BF16:
+            with_bfloat16(self.state.model)
+        self.log = TrainingLog(folder / LOG, self.state.step) if self.group.is_main else None
+
+    def fit(self, save_every: float, validate_every: int, on_step: OnStep | None = None) -> None:
+        """Train to the last step. save_every: seconds. validate_every: steps."""
+        saved = time.monotonic()
+        samples = prefetch(self.specs(), self.task.load)
+        while self.state.step < self.settings.steps:
+            entry = self.train_step(samples)
+            if self.log is None:
+                continue
+            if self.state.step % validate_every == 0 or self.state.step == self.settings.steps:
+                entry |= self.validate(self.log)
+            self.log.add(entry)
+            if on_step is not None:
+                on_step(entry)
+            if time.monotonic() - saved >= save_every:
+                self.save()
+                saved = time.monotonic()
+        samples.close()
+        if self.group.is_main:
+            self.save()
+
+    def phase(self, step: int) -> Phase:
+        """The phase of a step, counted from 0."""
+        return phase_at(self.phases, step, self.settings.steps)
+
+    def specs(self) -> Iterator[SampleSpec]:
+        """This process's samples of all steps that are left."""
+        for step in range(self.state.step, self.settings.steps):
+            for slot in self.group.shard(self.settings.batch):
+                yield self.task.spec(step, slot, self.phase(step))
+
+    def train_step(self, samples: Iterator[Any]) -> dict[str, Any]:
+        """Accumulate the gradients of a batch and make an optimiser step; returns what is logged."""
+        started = time.monotonic()
+        phase, batch = self.phase(self.state.step), self.settings.batch
+        entries = []
+        for _ in self.group.shard(batch):
+            loss, entry = self.task.loss(self.state.model, next(samples), self.state.step, phase)
+            (loss / batch).backward()
+            entries.append(entry)
+        self.group.all_reduce_gradients(self.state.model.parameters())
+        norm = self.state.update(lr_factor(self.phases, self.state.step, self.settings.steps))
+        means = {name: finite(value) for name, value in mean_entries(self.group.gather(entries)).items()}
+        seconds = round(time.monotonic() - started, 3)
+        return {"step": self.state.step, **means, "gradient": finite(norm), "seconds": seconds}
+
+    def validate(self, log: TrainingLog) -> dict[str, Any]:
+        """Metrics of the EMA network on validation scenes at the phase's size; writes predictions and curves."""
+        phase = self.phase(self.state.step - 1)
+        side = self.settings.size // phase.downsample
+        found = validate(self.state.ema_model(), phase, side, self.held_out, self.folder / PREDICTIONS)
+        write_curves(self.folder / CURVES, log.entries, PLOTTED)
+        return {name: finite(value) for name, value in found.items()}
+
+    def save(self) -> None:
+        """Write the checkpoint atomically."""
+        self.state.save(self.folder / CHECKPOINT, asdict(self.settings))
+
+
+def _sources(settings: TrainingSettings, config: IDESplatConfig) -> tuple[Source, Source]:
+    """Loaders of the training and of the validation samples: synthetic scenes, captures, or both."""
+    photos = Path(settings.textures) if settings.textures else None
+    if photos is not None:
+        photo_textures(photos)
+    synthetic = partial(generate_views, photos=photos)
+    if not settings.data:
+        return synthetic, synthetic
+    captures = CaptureScenes([Path(folder) for folder in settings.data], config.near, config.far)
+    if settings.real_ratio == 1:
+        return captures.load, captures.load_held_out
+    return (
+        lambda spec: captures.load(spec) if spec.real else synthetic(spec),
+        lambda spec: captures.load_held_out(spec) if spec.real else synthetic(spec),
+    )
+
+
+def _task(settings: TrainingSettings, model: IDESplat, source: Source, features: Path) -> TrainingTask[Any]:
+    """The task that the settings describe. features: folder of cached features."""
+    size, batch = settings.size, settings.batch
+    perceptual = _perceptual(settings) if settings.renders else None
+    if settings.part == Part.HEAD:
+        description = repr((size, settings.data, settings.textures, HeadInputs._fields))
+        cache = FeatureCache(features, model, source, description)
+        return HeadTask(cache, settings.seed, size, batch, settings.scenes, settings.real_ratio, perceptual)
+    objective = Objective(settings.objective)
+    return FullNetworkTask(settings.phases, objective, settings.seed, size, source, settings.real_ratio, perceptual)
+
+
+def _perceptual(settings: TrainingSettings) -> Perceptual | None:
+    """The perceptual distance of the settings; None also if that is LPIPS, and LPIPS is not installed."""
+    if settings.perceptual == PerceptualKind.LITE0:
+        return EfficientNetDistance()
+    if settings.perceptual == PerceptualKind.NONE:
+        return None
+    try:
+        return load_lpips()
+    except InputError:
+        return None
+
+
+def _prepare_process(threads: int) -> None:
+    """Configure PyTorch and the C library of this process."""
+    _keep_freed_memory()
+    torch.set_num_threads(threads)
+    torch.set_flush_denormal(True)
+
+
+def _keep_freed_memory() -> None:
+    """Make glibc keep freed memory for the next step; elsewhere do nothing."""
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    if mallopt is not None:
+        for parameter in (M_TRIM_THRESHOLD, M_MMAP_THRESHOLD):
+            mallopt(parameter, MAX_THRESHOLD)
