@@ -1,4 +1,4 @@
-"""The camera: one calibrated image."""
+"""The camera model: intrinsics, distortion and pose of one image."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -6,27 +6,28 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..errors import InputError
-from ..geometry.intrinsics import check_intrinsics
+from ..geometry.intrinsics import check_intrinsics, scale_intrinsics
 from ..geometry.rigid import check_rigid
 
-DISTORTION_LENGTHS = (4, 5, 8, 12, 14)  # that OpenCV's model may have
+DISTORTION_LENGTHS = (4, 5, 8, 12, 14)  # numbers of coefficients in OpenCV's model
 FISHEYE_LENGTH = 4
+MAX_SIDE = 1_000_000  # pixels
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """One calibrated picture.
+    """The camera of one image.
 
-    name: the image's path as the camera file writes it, such as `images/0001.jpg`.
-    width, height: the picture's size in pixels, upright.
-    K: float64, pixels, pixel centres at .5, no skew, [3, 3].
-    extrinsics: float64, camera-to-world, OpenCV axes (x right, y down, z forward), world units, [4, 4].
-    distortion: OpenCV's coefficients, k1 k2 p1 p2 and on as it orders them (4, 5, 8, 12 or 14), or None for a pinhole.
-    fisheye: the lens is one of cv2.fisheye's, and distortion its k1 k2 k3 k4.
-    depth_range: near and far, between which all lies that it sees, in world units; None where that is not known.
+    name: the image's path as stored in the camera file, such as `images/0001.jpg`.
+    width, height: the image size in pixels, upright.
+    K: intrinsics in pixels, pixel centres at 0.5, no skew, float64 [3, 3].
+    extrinsics: camera-to-world, OpenCV axes (x right, y down, z forward), world units, float64 [4, 4].
+    distortion: OpenCV's coefficients k1 k2 p1 p2 k3 ... in its order (4, 5, 8, 12 or 14), or None for a pinhole camera.
+    fisheye: the lens model is that of cv2.fisheye, and distortion its k1 k2 k3 k4.
+    depth_range: near and far bounds of the visible depth, in world units; None if unknown.
 
-    Raises InputError if a value is not finite or not plausible, or the pose is not rigid.
-    A rotation that is off by rounding only (1e-3) is made orthonormal.
+    Raises InputError if a value is not finite or not plausible, or the pose is not rigid. A rotation with rounding
+    errors (up to 1e-3) is made orthonormal.
     """
 
     name: str
@@ -41,7 +42,7 @@ class Camera:
     def __post_init__(self) -> None:
         if not (0 < self.width <= MAX_SIDE and 0 < self.height <= MAX_SIDE):
             size = f"{self.width:.6g} x {self.height:.6g}"
-            raise InputError(f"the image's size is {size}, expected 1 to {MAX_SIDE} pixels")
+            raise InputError(f"the image size is {size}, expected 1 to {MAX_SIDE} pixels")
         check_intrinsics(self.K, self.width, self.height)
         _check_distortion(self.distortion, self.fisheye)
         if self.depth_range is not None:
@@ -50,9 +51,9 @@ class Camera:
 
 
 def resize_camera(camera: Camera, width: int, height: int) -> Camera:
-    """Return the camera of the same picture at another size in pixels.
+    """The camera of the same image resized to width x height pixels.
 
-    Raises InputError if the aspect differs by more than rounding each side to a whole pixel explains.
+    Raises InputError if the aspect ratio differs by more than rounding each side to a whole pixel explains.
     """
     if (width, height) == (camera.width, camera.height):
         return camera
@@ -63,28 +64,27 @@ def resize_camera(camera: Camera, width: int, height: int) -> Camera:
             width / height - camera.width / camera.height
         )
         advice = (
-            "the cameras were made for the picture turned by 90 degrees: save the pictures as they were then, "
-            "without an EXIF rotation"
+            "the camera is of the image rotated by 90 degrees: save the image as it was, without an EXIF rotation"
             if rotated
-            else "give the pictures that the cameras were made for, or the same ones scaled"
+            else "give the images that the cameras were made for, at any scale"
         )
         raise InputError(
             f"the image has {width} x {height} pixels, its camera {camera.width} x {camera.height}; {advice}"
         )
-    scale = np.diag([width / camera.width, height / camera.height, 1.0])
-    return replace(camera, width=width, height=height, K=scale @ camera.K)
+    K = scale_intrinsics(camera.K, width / camera.width, height / camera.height)
+    return replace(camera, width=width, height=height, K=K)
 
 
 def offset_cameras(cameras: Sequence[Camera], offset: np.ndarray) -> list[Camera]:
-    """Cameras in a world whose origin is at `offset` [3] of theirs, as that of a scene with an offset is."""
+    """The cameras in a world frame whose origin is at `offset` [3] in the present one."""
     if not offset.any():
         return list(cameras)
-    moved = []
+    shifted = []
     for camera in cameras:
         extrinsics = camera.extrinsics.copy()
         extrinsics[:3, 3] -= offset
-        moved.append(replace(camera, extrinsics=extrinsics))
-    return moved
+        shifted.append(replace(camera, extrinsics=extrinsics))
+    return shifted
 
 
 def _check_distortion(distortion: tuple[float, ...] | None, fisheye: bool) -> None:
@@ -95,7 +95,7 @@ def _check_distortion(distortion: tuple[float, ...] | None, fisheye: bool) -> No
     if len(distortion) not in DISTORTION_LENGTHS:
         lengths = ", ".join(map(str, DISTORTION_LENGTHS))
         raise InputError(
-            f"distortion is {distortion}, expected k1, k2, p1, p2 and on as OpenCV has it: {lengths} numbers"
+            f"distortion is {distortion}, expected k1, k2, p1, p2, ... in OpenCV's order: {lengths} numbers"
         )
     if not np.isfinite(distortion).all():
         raise InputError(f"distortion is {distortion}, expected finite numbers")
@@ -103,7 +103,4 @@ def _check_distortion(distortion: tuple[float, ...] | None, fisheye: bool) -> No
 
 def _check_depth_range(depth_range: tuple[float, float]) -> None:
     if len(depth_range) != 2 or not np.isfinite(depth_range).all() or not 0 < depth_range[0] < depth_range[1]:
-        raise InputError(f"the range of depth is {depth_range}, expected 0 < nearest < farthest")
-
-
-MAX_SIDE = 1_000_000  # pixels
+        raise InputError(f"the depth range is {depth_range}, expected 0 < near < far")

@@ -1,4 +1,4 @@
-"""The images that a camera file leaves unnamed or unmeasured: among those that were given, or beside the file."""
+"""Finding the images of a camera file, among given images or beside the file, for names and sizes that it lacks."""
 
 import os
 from collections.abc import Sequence
@@ -8,24 +8,22 @@ from ..images.header import image_size
 from ..images.io import SUFFIXES, find_images, image_stem
 
 GIVE_IMAGES = "give the images with --images, which idesplat-cameras convert takes, too"
-
-
-# Where datasets keep the images that a camera file names: in its own folder, and in these of it and of those above,
-# since COLMAP's models lie in `sparse/0`.
+# Datasets keep images in the folder of the camera file, or in these subfolders of it or of a parent: COLMAP models lie
+# in `sparse/0`.
 IMAGE_FOLDERS = ("images", "image", "blended_images")
-FOLDERS_ABOVE = 3
+MAX_PARENTS = 3
 
 
 def image_roots(cameras: Path) -> list[Path]:
-    """The folder of a camera file, or the folder of cameras itself, and those above it that may hold its images."""
+    """The folder of a camera file (or `cameras` itself, if it is a folder) and its parents that may hold the images."""
     folder = cameras if os.path.isdir(cameras) else cameras.parent
-    return [folder, *folder.resolve().parents[:FOLDERS_ABOVE]]
+    return [folder, *folder.resolve().parents[:MAX_PARENTS]]
 
 
 class ImageSizes:
     """Sizes of the images that cameras name.
 
-    An image is the one among `images` with that name, whatever the suffix, or else a file relative to `folder`.
+    An image is found among `images` by its name without suffix, or else as a path relative to `folder`.
     """
 
     def __init__(self, folder: Path, images: Sequence[Path]) -> None:
@@ -33,7 +31,7 @@ class ImageSizes:
         self._given = {image_stem(image): image for image in reversed(images)}
 
     def size(self, name: str) -> tuple[int, int] | None:
-        """Width and height of the image that a camera names, or None where there is no such image.
+        """Width and height of the image with this name, or None if it is not found.
 
         Raises InputError if the image cannot be read.
         """
@@ -46,13 +44,13 @@ class ImageSizes:
 
 
 def candidate_paths(folder: Path, name: str) -> list[Path]:
-    """Where the image that a camera names may lie, seen from a folder: names may lack the suffix."""
+    """Paths of an image in a folder, by a name that may lack the suffix."""
     beside = os.path.join(folder, name.replace("\\", "/"))
     return [Path(beside + suffix) for suffix in ("", *SUFFIXES)]
 
 
 def images_in_folder(folder: Path) -> list[Path]:
-    """The images of a folder in the order of their names, character by character; none where there is none."""
+    """The images of a folder, sorted by name as text (not naturally); empty if there is no such folder."""
     if not folder.is_dir() or not any(path.suffix.lower() in SUFFIXES for path in folder.iterdir()):
         return []
     return sorted(find_images([folder]))

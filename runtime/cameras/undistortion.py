@@ -1,28 +1,28 @@
-"""Undistortion: the image that a pinhole camera would have taken."""
+"""Undistortion: resampling an image to a pinhole camera with the same K."""
 
 from dataclasses import replace
 
 import cv2
 import numpy as np
 
-from ..images.io import HALF_PIXEL
+from ..geometry.intrinsics import to_opencv_pixels
 from .camera import Camera
 
 
 def undistort(image: np.ndarray, camera: Camera) -> tuple[np.ndarray, Camera]:
-    """Return the picture a pinhole camera with the same K would take, and that camera.
+    """The image resampled to a pinhole camera with the same K, and that camera.
 
-    image: [height, width, 3] of the camera's size. What the lens did not see is filled with the nearest pixel.
+    image: [height, width, 3] of the camera's size. Pixels outside the input image repeat its border.
     """
     if camera.distortion is None:
         return image, camera
     map_x, map_y = _undistortion_maps(camera)
-    straight = cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return straight, replace(camera, distortion=None, fisheye=False)
+    undistorted = cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return undistorted, replace(camera, distortion=None, fisheye=False)
 
 
 def undistortion_valid_mask(camera: Camera) -> np.ndarray:
-    """Where `undistort` shows what the lens saw, and nothing filled in: bool, [height, width]."""
+    """The pixels that `undistort` takes from inside the input image: bool [height, width]."""
     if camera.distortion is None:
         return np.ones((camera.height, camera.width), bool)
     map_x, map_y = _undistortion_maps(camera)
@@ -30,8 +30,8 @@ def undistortion_valid_mask(camera: Camera) -> np.ndarray:
 
 
 def _undistortion_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """For each pixel of the undistorted picture, where it lies in the photograph, in OpenCV's pixel coordinates."""
-    K = camera.K - HALF_PIXEL * np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]])
+    """Input coordinates x and y of each undistorted pixel, in OpenCV's pixels: float32 [height, width] each."""
+    K = to_opencv_pixels(camera.K)
     size = camera.width, camera.height
     lens = cv2.fisheye if camera.fisheye else cv2
     return lens.initUndistortRectifyMap(K, np.array(camera.distortion), np.eye(3), K, size, cv2.CV_32FC1)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ..cameras.format_names import CameraFormat
+from ..cameras.formats import CameraFormat
 from ..errors import InputError, exit_on_input_error
 from .outputs import Overwrite, guards_outputs, outputs
 from .terminal import run, say

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ..cameras.format_names import ESTIMATE, CameraFormat
+from ..cameras.formats import ESTIMATE, CameraFormat
 from ..errors import InputError, exit_on_input_error
 from ..inference.depth_format import DepthFormat
 from .outputs import STANDARD_OUTPUT, Overwrite, guards_outputs, name_files, outputs, write_json

@@ -23,25 +23,9 @@ def model_files(model: Path) -> list[Path]:
 
 def camera_files(cameras: Path) -> list[Path]:
     """The files that are read where this file or folder is given as cameras."""
-    from ..cameras.format_names import COLMAP_PARTS
-    from ..cameras.formats import colmap as cameras_colmap
-    from ..cameras.formats import dtu as cameras_dtu
-    from ..cameras.formats import llff as cameras_llff
-    from ..cameras.formats import opencv as cameras_opencv
-    from ..cameras.formats import transforms as cameras_transforms
+    from ..cameras.io import input_files
 
-    if not os.path.isdir(cameras):
-        found = [cameras]
-        if cameras.stem in cameras_opencv.OTHER_HALF:
-            found.append(cameras.with_stem(cameras_opencv.OTHER_HALF[cameras.stem]))
-        folder = cameras.parent if cameras.stem in COLMAP_PARTS else None
-    else:
-        found = [cameras / cameras_transforms.FILE_NAME, cameras / cameras_llff.FILE_NAME]
-        found += cameras_dtu.files_in(cameras)
-        folder = cameras
-    if folder is not None:
-        found += [path for model in cameras_colmap.models_in(folder) for path in _children(model)]
-    return [path for path in found if os.path.isfile(path)]
+    return [path for path in input_files(cameras) if os.path.isfile(path)]
 
 
 def given_images(given: Sequence[str | Path]) -> list[Path]:

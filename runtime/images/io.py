@@ -28,7 +28,6 @@ UNSUPPORTED_SUFFIXES = (
 )
 MAX_FILE_SIZE = 1 << 31  # bytes
 NAMED = 3  # files that a note names
-HALF_PIXEL = 0.5  # OpenCV's geometry puts pixel centres at whole numbers, ours at .5
 
 
 def find_images(given: Sequence[str | Path]) -> list[Path]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..cameras.camera import Camera
-from ..cameras.format_names import ESTIMATE, CameraFormat
+from ..cameras.formats import ESTIMATE, CameraFormat
 from ..cameras.io import read_cameras
 from ..errors import InputError
 from ..images.io import describe_unsupported, image_stem

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from ..geometry.intrinsics import HALF_PIXEL
 from ..geometry.rigid import invert_rigid
 
-HALF_PIXEL = 0.5  # OpenCV's keypoints lie at whole numbers in pixel centres
 MOST_FEATURES = 4000  # of one picture
 CONTRAST = 0.02  # half of SIFT's own threshold, for indoor walls
 DISTINCT = 0.8  # a match's distance over that of the second best

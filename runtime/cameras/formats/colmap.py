@@ -1,10 +1,11 @@
-"""COLMAP's sparse models, binary and text, with rigs and frames or without, through pycolmap (extra `colmap`).
+"""COLMAP sparse models, binary and text, with and without rigs and frames, read by pycolmap (extra `colmap`).
 
-COLMAP is as we are: OpenCV axes, pixels with the centre of the first at (.5, .5); its poses are world-to-camera.
-Images that were not registered are left out. The points that an image observes give its range of depth.
+Conventions (https://colmap.github.io/format.html): OpenCV axes; pixel centres at half-integers, as ours; poses are
+world-to-camera, and are inverted here. Images without a pose are skipped. The 3D points that an image observes give its
+depth range.
 
-A damaged binary model can make the library ask for all memory or never come back, so a process of its own reads it,
-within limits: this module run as a program prints what it found, as JSON.
+pycolmap can allocate all memory, or hang, on a damaged binary model. So a child process with resource limits reads the
+model: this module, run as a program, which prints the images as JSON.
 """
 
 import importlib.util
@@ -25,17 +26,19 @@ from ...geometry.intrinsics import intrinsic_matrix
 from ...geometry.rigid import invert_rigid
 from ...system.files import check_regular, open_regular
 from ..camera import Camera
-from ..format_names import COLMAP_PARTS
+from ..source import CameraSource
 
 if TYPE_CHECKING:
     import pycolmap
 
+DESCRIPTION = "a COLMAP model"
 PARTS = ("cameras", "images", "points3D")
+ALL_PARTS = (*PARTS, "frames", "rigs")
 SUFFIXES = (".bin", ".txt")
-# Where COLMAP, nerfstudio and 3DGS put models, seen from the folder that holds everything.
-USUAL_PLACES = ("", "sparse", "colmap/sparse")
+# Where COLMAP, nerfstudio and 3DGS put models, relative to the folder of the scene.
+MODEL_FOLDERS = ("", "sparse", "colmap/sparse")
 
-# COLMAP's parameters in the order of its files.
+# Parameters of the camera models, in the order of COLMAP's files.
 FOCAL, FOCALS = ("f", "cx", "cy"), ("fx", "fy", "cx", "cy")
 PERSPECTIVE = {
     "SIMPLE_PINHOLE": FOCAL,
@@ -51,19 +54,35 @@ FISHEYE = {
     "OPENCV_FISHEYE": (*FOCALS, "k1", "k2", "k3", "k4"),
 }
 
-DEPTHS_USED = 500  # of one image, at least
+DEPTHS_USED = 500  # points of an image that are sampled for its depth range, at least
 COUNT_BYTES, SMALLEST_RECORD = 8, 8
-# Of processor time, which other processes do not lengthen; a wall clock ends only what waits for ever.
-SECONDS, SECONDS_PER_MB = 20, 2
-WALL_FACTOR = 20
-OUT_OF_TIME = -getattr(signal, "SIGXCPU", 24)  # exit status of a process that the system ended for it
-MEMORY, MEMORY_PER_BYTE = 4 << 30, 40
-UNFINISHED = "COLMAP's library did not finish reading this model; is it damaged?"
+# Limits of the child process. CPU time does not depend on other processes; the wall time only ends a child that waits.
+CPU_SECONDS, CPU_SECONDS_PER_MB = 20, 2
+WALL_TIME_FACTOR = 20
+CPU_TIME_EXCEEDED = -getattr(signal, "SIGXCPU", 24)  # exit status
+MEMORY, MEMORY_PER_BYTE = 4 << 30, 40  # bytes
+NOT_FINISHED = "pycolmap did not finish reading this model; is it damaged?"
 INSTALL = 'pip install "idesplat[colmap]"'
 
 
+def detect(source: CameraSource) -> bool:
+    """Whether a file is a part of a model, or a folder holds one, also in its usual subfolders."""
+    if source.is_folder:
+        return bool(models_in(source.path))
+    return source.path.stem in ALL_PARTS and source.path.suffix in SUFFIXES
+
+
+def input_files(path: Path) -> list[Path]:
+    """All files of the models in a folder, or of the model that a file belongs to."""
+    if not path.is_dir():
+        if path.stem not in ALL_PARTS:
+            return []
+        path = path.parent
+    return [file for model in models_in(path) for file in sorted(model.iterdir())]
+
+
 def read(path: Path, images: Sequence[Path] = ()) -> list[Camera]:
-    """Read the model in a folder, in its usual place below, or beside one of its files; `images` are not needed.
+    """Read the model in a folder, in its usual subfolders, or beside one of its files; `images` are not used.
 
     Raises InputError, also where pycolmap is not installed.
     """
@@ -73,16 +92,16 @@ def read(path: Path, images: Sequence[Path] = ()) -> list[Camera]:
     if len(models) > 1:
         raise InputError(f"holds {len(models)} COLMAP models; give one of them, such as {models[0]}")
     cameras = []
-    for image in _read_apart(models[0]):
+    for image in _read_in_child_process(models[0]):
         with error_context(image["name"]):
             cameras.append(to_camera(image))
     return cameras
 
 
 def models_in(folder: Path) -> list[Path]:
-    """The folder if it holds a model, or the models in their usual places below it."""
-    for place in USUAL_PLACES:
-        parent = folder / place
+    """The folder if it holds a model, or else the models in its usual subfolders."""
+    for subfolder in MODEL_FOLDERS:
+        parent = folder / subfolder
         numbered = sorted(parent.glob("[0-9]*")) if parent.is_dir() else []
         found = [candidate for candidate in (parent, *numbered) if _is_model(candidate)]
         if found:
@@ -94,8 +113,8 @@ def _is_model(folder: Path) -> bool:
     return any(all((folder / (part + suffix)).is_file() for part in PARTS) for suffix in SUFFIXES)
 
 
-def _read_apart(model: Path) -> list[dict[str, Any]]:
-    """What `describe` finds, through a process that may fail in any way."""
+def _read_in_child_process(model: Path) -> list[dict[str, Any]]:
+    """The result of `describe` in a child process with resource limits."""
     if importlib.util.find_spec("pycolmap") is None:
         raise InputError(f"is a COLMAP model, for which pycolmap is needed; {INSTALL}")
     files = [file for file in model.iterdir() if file.suffix in SUFFIXES]
@@ -103,39 +122,41 @@ def _read_apart(model: Path) -> list[dict[str, Any]]:
         check_regular(file)
     _check_counts(files)
     size = sum(file.stat().st_size for file in files)
-    # -P: or else Python would look for modules in the current folder first
-    seconds = math.ceil(SECONDS + SECONDS_PER_MB * size / 1e6)
+    seconds = math.ceil(CPU_SECONDS + CPU_SECONDS_PER_MB * size / 1e6)
     limits = str(MEMORY + MEMORY_PER_BYTE * size), str(seconds)
+    # -P keeps Python from importing modules from the current folder.
     command = [sys.executable, "-P", "-m", __name__, str(model.absolute()), *limits]
     try:
-        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=WALL_FACTOR * seconds)
+        done = subprocess.run(
+            command, stdin=subprocess.DEVNULL, capture_output=True, timeout=WALL_TIME_FACTOR * seconds
+        )
     except subprocess.TimeoutExpired:
-        raise InputError(UNFINISHED) from None
-    if done.returncode == OUT_OF_TIME:
-        raise InputError(UNFINISHED)
+        raise InputError(NOT_FINISHED) from None
+    if done.returncode == CPU_TIME_EXCEEDED:
+        raise InputError(NOT_FINISHED)
     if done.returncode != 0:
         reason = done.stderr.decode(errors="replace").strip().splitlines()[-1:] or [f"exit status {done.returncode}"]
-        raise InputError(f"COLMAP's library cannot read this model ({reason[0]}); is it damaged?")
+        raise InputError(f"pycolmap cannot read this model ({reason[0]}); is it damaged?")
     images: list[dict[str, Any]] = json.loads(done.stdout)
     if not images:
-        raise InputError("holds no registered image, expected a model with poses; is the reconstruction complete?")
+        raise InputError("holds no registered image, expected images with poses; is the reconstruction complete?")
     return images
 
 
 def _check_counts(files: Sequence[Path]) -> None:
-    """Refuse a binary file whose first number, the count of its records, promises more than the file can hold."""
+    """Raise InputError for a binary file whose first number, the record count, exceeds what its size allows."""
     for file in files:
-        if file.suffix == ".bin" and file.stem in COLMAP_PARTS:
+        if file.suffix == ".bin" and file.stem in ALL_PARTS:
             with open_regular(file) as opened:
                 count = int.from_bytes(opened.read(COUNT_BYTES), "little")
             if count * SMALLEST_RECORD > file.stat().st_size:
                 raise InputError(
-                    f"{file.name} has room for fewer than the {count} records that it promises: cut off or damaged"
+                    f"{file.name} declares {count} records, more than its size allows: truncated or damaged"
                 )
 
 
 def to_camera(image: dict[str, Any]) -> Camera:
-    """The camera of an image as `describe` gives it; raises InputError for a lens that is not ours."""
+    """The camera of an image from `describe`. Raises InputError for an unsupported camera model."""
     model = image["model"]
     fields = PERSPECTIVE.get(model) or FISHEYE.get(model)
     if fields is None:
@@ -161,11 +182,11 @@ def to_camera(image: dict[str, Any]) -> Camera:
     )
 
 
-# ---- what the library holds; from a file, in a process of its own
+# ---- a model in memory, as plain values
 
 
 def describe(reconstruction: "pycolmap.Reconstruction") -> list[dict[str, Any]]:
-    """The registered images of a model, in plain values as `to_camera` takes them, by name."""
+    """The registered images of a model, sorted by name, as JSON values for `to_camera`."""
     images = [image for image in reconstruction.images.values() if image.has_pose]
     found = []
     for image in sorted(images, key=lambda image: image.name):
@@ -185,7 +206,7 @@ def describe(reconstruction: "pycolmap.Reconstruction") -> list[dict[str, Any]]:
 
 
 def observed_depths(reconstruction: "pycolmap.Reconstruction", image: "pycolmap.Image") -> np.ndarray:
-    """Depths of the points that an image observes, or of some of them, [points]."""
+    """Depths of the 3D points that an image observes, [points]; subsampled to between 500 and 1000 points."""
     observed = image.get_observation_point2D_idxs()
     observed = observed[:: max(1, len(observed) // DEPTHS_USED)]
     points = np.array([reconstruction.point3D(image.point2D(index).point3D_id).xyz for index in observed]).reshape(
@@ -210,5 +231,5 @@ if __name__ == "__main__":
         import pycolmap
 
         print(json.dumps(describe(pycolmap.Reconstruction(sys.argv[1]))))
-    except Exception as error:  # whatever the library raises is a damaged model
+    except Exception as error:  # pycolmap raises many types for damaged models
         sys.exit(" ".join(str(error).split()))

@@ -1,8 +1,8 @@
-"""LLFF's poses_bounds.npy: a row of 17 numbers for each photograph, in the order of their names.
+"""LLFF's poses_bounds.npy: 17 numbers for each image, in the order of the image names, which it does not store.
 
-A row is a 3 x 5 matrix and two depths. The matrix holds a camera-to-world pose, whose axes point down, right and
-backwards, and a column of height, width and focal length in pixels; the principal point is the middle. The depths are
-of the nearest and the farthest of COLMAP's points, so that near and far get some room. No photographs are named.
+A row is a 3 x 5 matrix and a depth range. The matrix is a camera-to-world pose whose axes point down, right and
+backwards, and a column of height, width and focal length in pixels; the principal point is the image centre. The depth
+range is that of COLMAP's points, so it is widened by a margin.
 """
 
 from collections.abc import Sequence
@@ -14,15 +14,29 @@ from ...errors import InputError, error_context
 from ...geometry.intrinsics import intrinsic_matrix
 from ...system.files import check_regular
 from ..camera import Camera
+from ..source import CameraSource
 
+DESCRIPTION = "LLFF's poses_bounds.npy"
 FILE_NAME = "poses_bounds.npy"
 COLUMNS = 17
-NEAR_ROOM, FAR_ROOM = 0.75, 1.5
+NEAR_MARGIN, FAR_MARGIN = 0.75, 1.5
 IMAGE_FOLDERS = ("images", "images_4", "images_8")
 
 
+def detect(source: CameraSource) -> bool:
+    """Whether a file is a NumPy array, or a folder holds a poses_bounds.npy."""
+    if source.is_folder:
+        return (source.path / FILE_NAME).is_file()
+    return source.start.startswith(b"\x93NUMPY")
+
+
+def input_files(path: Path) -> list[Path]:
+    """The poses_bounds.npy of a folder."""
+    return [path / FILE_NAME] if path.is_dir() else []
+
+
 def read(path: Path, images: Sequence[Path] = ()) -> list[Camera]:
-    """Read the file; `images`, or those in `images` beside the file, give the names. Raises InputError."""
+    """Read the file. images: give the names; by default those in `images` beside the file. Raises InputError."""
     path = path / FILE_NAME if path.is_dir() else path
     rows = _rows(path)
     cameras = []
@@ -42,33 +56,33 @@ def _camera(name: str, row: np.ndarray) -> Camera:
     pose[:3] = np.stack([right, down, -backwards, position], axis=1)
     K = intrinsic_matrix(focal, focal, width / 2, height / 2)
     near, far = float(row[15]), float(row[16])
-    return Camera(name, int(width), int(height), K, pose, depth_range=(NEAR_ROOM * near, FAR_ROOM * far))
+    return Camera(name, int(width), int(height), K, pose, depth_range=(NEAR_MARGIN * near, FAR_MARGIN * far))
 
 
 def _rows(path: Path) -> np.ndarray:
-    """The array [photographs, 17], float64."""
+    """The array [images, 17], float64."""
     try:
         check_regular(path)
-        # Mapped, so that a header that promises more than there is costs no memory.
+        # Memory-mapped, so that a damaged header with a large shape allocates nothing.
         rows = np.load(path, mmap_mode="r", allow_pickle=False)
     except InputError:
         raise
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error}); expected LLFF's {FILE_NAME}") from None
-    except Exception as error:  # a damaged header raises many kinds
+    except Exception as error:  # NumPy raises many types for damaged headers
         raise InputError(f"is not a NumPy array ({error}); expected LLFF's {FILE_NAME}") from None
     if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.shape[1] != COLUMNS or rows.dtype.kind != "f":
         kind = f"{rows.dtype} of shape {rows.shape}" if isinstance(rows, np.ndarray) else "several arrays"
-        raise InputError(f"holds {kind}, expected floating-point numbers, [photographs, {COLUMNS}]")
+        raise InputError(f"holds {kind}, expected floating-point numbers, [images, {COLUMNS}]")
     if len(rows) == 0:
-        raise InputError(f"holds no photograph, expected [photographs, {COLUMNS}]")
+        raise InputError(f"holds no cameras, expected [images, {COLUMNS}]")
     return np.array(rows, np.float64)
 
 
 def _names(count: int, folder: Path, images: Sequence[Path]) -> list[str]:
-    """The photographs that the rows belong to: all that were given, or those beside the file, if the number is right.
+    """The image names of the rows: of the images given, or of those beside the file, if there are `count` of them.
 
-    Without any, the rows are numbered.
+    Without images, the rows are numbered. Raises InputError if another number of images is given.
     """
     from ..image_files import images_in_folder
 

@@ -1,9 +1,9 @@
-"""OpenCV's stereo calibration, YAML or XML of cv2.FileStorage: two cameras, K and distortion of each, R and T.
+"""OpenCV stereo calibrations, YAML or XML of cv2.FileStorage: K and distortion of two cameras, and R and T.
 
-A point x of the first camera is R x + T in the second; the first camera is the world. OpenCV's pixel centres are whole
-numbers, so half a pixel is added to its principal points. Where a calibration is in two files, intrinsics.yml and
-extrinsics.yml, as OpenCV's sample writes it, either leads to the other. The file names no images: it takes two, the
-left (first) one before the right one, and their size where the file lacks it.
+R and T are as in cv2.stereoCalibrate: x2 = R x1 + T, with points x1 and x2 in the frames of the first and the second
+camera. The first camera's frame is the world. OpenCV's pixel centres are at integers, so 0.5 is added to the principal
+points. Of a calibration in two files, intrinsics.yml and extrinsics.yml as OpenCV's sample writes them, either can be
+given. The file stores no image names: two images are given, left and right, which also give the size if it is missing.
 """
 
 from collections.abc import Sequence
@@ -13,31 +13,41 @@ from typing import Any
 import numpy as np
 
 from ...errors import InputError, error_context
+from ...geometry.intrinsics import from_opencv_pixels
 from ...geometry.rigid import invert_rigid
 from ...system.files import read_bytes
 from ..camera import Camera
-from ..parsing import EXPECTED, LARGEST
+from ..parsing import EXPECTED, MAX_FILE_SIZE
+from ..source import CameraSource
 
-# What the fields are called, in OpenCV's documentation, samples and forums.
+DESCRIPTION = "OpenCV's stereo calibration"
+# Field names in OpenCV's documentation, samples and forums.
 MATRIX = ("M{}", "K{}", "cameraMatrix{}", "camera_matrix_{}", "camera_matrix{}", "CM{}")
 DISTORTION = ("D{}", "distCoeffs{}", "dist_coeffs_{}", "dist_coeffs{}", "distortion_coefficients_{}")
 ROTATION = ("R", "rotation", "Rotation", "rotation_matrix")
 TRANSLATION = ("T", "translation", "Translation", "translation_vector")
 SIZE = ("imageSize", "image_size", "img_size", "size")
 WIDTH, HEIGHT = ("image_width", "imageWidth", "width"), ("image_height", "imageHeight", "height")
-OTHER_HALF = {"intrinsics": "extrinsics", "extrinsics": "intrinsics"}
+OTHER_FILE = {"intrinsics": "extrinsics", "extrinsics": "intrinsics"}
 NAMES = ("left", "right")
-HALF_PIXEL = 0.5
+
+
+def detect(source: CameraSource) -> bool:
+    """Whether a file is YAML with a directive or XML, as cv2.FileStorage writes them."""
+    return source.start.startswith((b"%YAML", b"<?xml", b"<opencv_storage"))
+
+
+def input_files(path: Path) -> list[Path]:
+    """The other file of a calibration in two files."""
+    return [path.with_stem(OTHER_FILE[path.stem])] if path.stem in OTHER_FILE else []
 
 
 def read(path: Path, images: Sequence[Path] = ()) -> list[Camera]:
-    """Read the file; `images` are the left and the right one, in this order. Raises InputError."""
+    """Read the file. images: the left and the right one, in this order. Raises InputError."""
     if images and len(images) != len(NAMES):
-        raise InputError(
-            f"calibrates two cameras, and {len(images)} images were given; give the left and the right one"
-        )
+        raise InputError(f"calibrates two cameras, but {len(images)} images are given; give the left and the right one")
     fields = _fields(path)
-    other = path.with_stem(OTHER_HALF.get(path.stem, path.stem))
+    other = path.with_stem(OTHER_FILE.get(path.stem, path.stem))
     if other != path and other.is_file():
         with error_context(other.name):
             fields = {**_fields(other), **fields}
@@ -54,18 +64,17 @@ def read(path: Path, images: Sequence[Path] = ()) -> list[Camera]:
 
 
 def _camera(fields: dict[str, Any], number: int, name: str, size: tuple[int, int], extrinsics: np.ndarray) -> Camera:
-    K = _matrix(fields, [form.format(number) for form in MATRIX], (3, 3))
-    K = K + HALF_PIXEL * np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]])
+    K = from_opencv_pixels(_matrix(fields, [form.format(number) for form in MATRIX], (3, 3)))
     forms = [form.format(number) for form in DISTORTION]
     values = _matrix(fields, forms).ravel().tolist() if any(form in fields for form in forms) else []
     return Camera(name, *size, K, extrinsics, tuple(values) if any(values) else None)
 
 
 def _fields(path: Path) -> dict[str, Any]:
-    """The fields of the file's top level: numbers, text and matrices (float64)."""
+    """The top-level fields of the file: numbers, text and matrices (float64)."""
     import cv2
 
-    text = read_bytes(path, EXPECTED, LARGEST).decode("utf-8", errors="replace")
+    text = read_bytes(path, EXPECTED, MAX_FILE_SIZE).decode("utf-8", errors="replace")
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         root = storage.root()
@@ -76,7 +85,7 @@ def _fields(path: Path) -> dict[str, Any]:
 
 
 def _value(node: Any) -> Any:
-    """A node of cv2.FileStorage as number, text, matrix or list of numbers; None if it is anything else."""
+    """A node of cv2.FileStorage as a number, text, matrix or list of numbers; None for other types."""
     if node.isReal() or node.isInt():
         return node.real()
     if node.isString():
@@ -93,11 +102,11 @@ def _value(node: Any) -> Any:
 
 
 def _matrix(fields: dict[str, Any], names: Sequence[str], shape: tuple[int, ...] | None = None) -> np.ndarray:
-    """The first of these fields that is there, of this many numbers; raises InputError."""
+    """The first of these fields that exists, reshaped to `shape` if given. Raises InputError."""
     name = next((name for name in names if name in fields), None)
     if name is None:
         raise InputError(
-            f"{names[0]} is missing (or {', '.join(names[1:])}); give the file that holds it, or both in one"
+            f"{names[0]} is missing (or {', '.join(names[1:])}); give the file that holds it, or one file with both"
         )
     value = fields[name]
     if not isinstance(value, np.ndarray) or (shape and value.size != np.prod(shape)):
@@ -110,7 +119,7 @@ def _matrix(fields: dict[str, Any], names: Sequence[str], shape: tuple[int, ...]
 
 
 def _rotation(value: np.ndarray) -> np.ndarray:
-    """A rotation [3, 3], also where the file holds its axis times its angle."""
+    """A rotation matrix [3, 3], from a matrix or a rotation vector (axis times angle)."""
     import cv2
 
     if value.size == 3:
@@ -121,7 +130,7 @@ def _rotation(value: np.ndarray) -> np.ndarray:
 
 
 def _size(fields: dict[str, Any], images: Sequence[Path]) -> tuple[int, int]:
-    """Width and height, from the file or else from the image."""
+    """Width and height, from the file or from the first of the images."""
     size = next((fields[name] for name in SIZE if name in fields), None)
     if isinstance(size, np.ndarray) and size.size == 2:
         width, height = size.ravel().tolist()
@@ -135,5 +144,5 @@ def _size(fields: dict[str, Any], images: Sequence[Path]) -> tuple[int, int]:
     from ..image_files import GIVE_IMAGES
 
     if not images:
-        raise InputError(f"gives no {SIZE[0]}, and there is no image to take it from; {GIVE_IMAGES}")
+        raise InputError(f"has no {SIZE[0]}, and no image is given that tells it; {GIVE_IMAGES}")
     return image_size(images[0])

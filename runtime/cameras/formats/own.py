@@ -1,11 +1,11 @@
-"""This project's own file of cameras: the inside convention as it is, one object for each camera.
+"""This project's own JSON format: one object for each camera, in the conventions of `Camera`.
 
 {"format": "idesplat-cameras", "version": 1, "cameras": [
   {"image": "images/0001.jpg", "width": 1080, "height": 1920,
-   "fx": 1375.5, "fy": 1374.5, "cx": 554.6, "cy": 965.3,     pixels, pixel centres at .5
-   "distortion": [k1, k2, p1, p2],                           as OpenCV orders them; null or absent for a pinhole
-   "fisheye": true,                                          [k1, k2, k3, k4] of cv2.fisheye; absent elsewhere
-   "depth_range": [1.5, 20.0],                               nearest and farthest depth it sees; absent if unknown
+   "fx": 1375.5, "fy": 1374.5, "cx": 554.6, "cy": 965.3,     pixels, pixel centres at 0.5
+   "distortion": [k1, k2, p1, p2],                           in OpenCV's order; null or absent for a pinhole camera
+   "fisheye": true,                                          distortion is [k1, k2, k3, k4] of cv2.fisheye; or absent
+   "depth_range": [1.5, 20.0],                               near and far depth of what is visible; absent if unknown
    "extrinsics": [[...], [...], [...], [0, 0, 0, 1]]}]}      camera-to-world, OpenCV axes
 """
 
@@ -18,19 +18,26 @@ from ...errors import InputError, error_context
 from ...geometry.intrinsics import intrinsic_matrix
 from ...system.files import atomic_write
 from ..camera import Camera
-from ..parsing import entries, finite, image_name, number, pixels, pose, read_json, shown
+from ..parsing import entries, finite, image_name, number, pixels, pose, read_json, short_repr
+from ..source import CameraSource
 
+DESCRIPTION = 'this project\'s JSON ("format": "idesplat-cameras")'
 FORMAT = "idesplat-cameras"
 VERSION = 1
 
 
+def detect(source: CameraSource) -> bool:
+    """Whether a JSON file has this format's name in its field `format`."""
+    return source.document.get("format") == FORMAT
+
+
 def read(path: Path, images: Sequence[Path] = ()) -> list[Camera]:
-    """Read the file; `images` are not needed. Raises InputError."""
+    """Read the file; `images` are not used. Raises InputError."""
     document = read_json(path)
     if document.get("format") != FORMAT:
-        raise InputError(f'format is {shown(document.get("format"))}, expected "{FORMAT}"')
+        raise InputError(f'format is {short_repr(document.get("format"))}, expected "{FORMAT}"')
     if document.get("version") != VERSION:
-        raise InputError(f"version is {shown(document.get('version'))}, expected {VERSION}; update idesplat")
+        raise InputError(f"version is {short_repr(document.get('version'))}, expected {VERSION}; update idesplat")
     cameras = []
     for index, entry in enumerate(entries(document, "cameras")):
         with error_context(f"cameras[{index}]"):
@@ -41,7 +48,7 @@ def read(path: Path, images: Sequence[Path] = ()) -> list[Camera]:
 
 
 def write(path: Path, cameras: Sequence[Camera]) -> None:
-    """Write the file; `read` gives exactly the same numbers back. Raises InputError if the folder cannot be written."""
+    """Write the file, which `read` reads back exactly. Raises InputError if the folder is not writable."""
     lines = ",\n".join(json.dumps(_entry(camera)) for camera in cameras)
     with atomic_write(path) as temporary:
         temporary.write_text(f'{{"format": "{FORMAT}", "version": {VERSION}, "cameras": [\n{lines}\n]}}\n')
@@ -50,7 +57,7 @@ def write(path: Path, cameras: Sequence[Camera]) -> None:
 def _camera(entry: dict[str, Any], name: str) -> Camera:
     fisheye = entry.get("fisheye", False)
     if not isinstance(fisheye, bool):
-        raise InputError(f"fisheye is {shown(fisheye)}, expected true or false")
+        raise InputError(f"fisheye is {short_repr(fisheye)}, expected true or false")
     return Camera(
         name,
         pixels(entry, "width"),
@@ -68,7 +75,7 @@ def _numbers(entry: dict[str, Any], field: str) -> tuple[float, ...] | None:
     if values is None:
         return None
     if not isinstance(values, list):
-        raise InputError(f"{field} is {shown(values)}, expected null or a list of numbers")
+        raise InputError(f"{field} is {short_repr(values)}, expected null or a list of numbers")
     return tuple(finite(value, field) for value in values)
 
 

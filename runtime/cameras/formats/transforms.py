@@ -1,8 +1,8 @@
-"""transforms.json of nerfstudio, instant-ngp and Blender's synthetic scenes: camera-to-world with OpenGL axes.
+"""transforms.json of nerfstudio, instant-ngp and NeRF's synthetic scenes: camera-to-world poses with OpenGL axes.
 
-Intrinsics stand in the document for all frames, or in a frame for itself: `fl_x fl_y cx cy`, or `camera_angle_x` in
-radians; `w h`, or the size of the images, which are looked for beside the file. `camera_model` says what the
-coefficients mean: OpenCV's k1 k2 p1 p2 k3, or with OPENCV_FISHEYE (`is_fisheye` in instant-ngp's) k1 k2 k3 k4.
+Intrinsics are fields of the document, for all frames, or of a frame, which take precedence: `fl_x fl_y cx cy`, or
+`camera_angle_x` in radians; `w h`, or else the size of the images beside the file. `camera_model` defines the
+distortion: k1 k2 p1 p2 k3 as in OpenCV, or for OPENCV_FISHEYE (instant-ngp: `is_fisheye`) k1 k2 k3 k4 of cv2.fisheye.
 """
 
 import json
@@ -19,11 +19,13 @@ from ...errors import InputError, error_context
 from ...geometry.intrinsics import intrinsic_matrix
 from ...system.files import atomic_write
 from ..camera import Camera
-from ..parsing import entries, image_name, number, pixels, pose, read_json, shown
+from ..parsing import entries, image_name, number, pixels, pose, read_json, short_repr
+from ..source import CameraSource
 
 if TYPE_CHECKING:
     from ..image_files import ImageSizes
 
+DESCRIPTION = "transforms.json"
 FILE_NAME = "transforms.json"
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 FISHEYE_MODEL = "OPENCV_FISHEYE"
@@ -32,11 +34,21 @@ PERSPECTIVE_FIELDS = ("k1", "k2", "p1", "p2", "k3")  # in OpenCV's order
 FISHEYE_FIELDS = ("k1", "k2", "k3", "k4")
 DISTORTION_FIELDS = {"k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"}
 INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y")
-NARROWEST_VIEW = 0.001  # radians
+MIN_FIELD_OF_VIEW = 0.001  # radians
+
+
+def detect(source: CameraSource) -> bool:
+    """Whether a JSON file has frames, or a folder holds a transforms.json."""
+    return (source.path / FILE_NAME).is_file() if source.is_folder else "frames" in source.document
+
+
+def input_files(path: Path) -> list[Path]:
+    """The transforms.json of a folder."""
+    return [path / FILE_NAME] if path.is_dir() else []
 
 
 def read(path: Path, images: Sequence[Path] = ()) -> list[Camera]:
-    """Read the file; `images` give the sizes that it lacks. Raises InputError."""
+    """Read the file. images: give the sizes that are missing in it. Raises InputError."""
     path = path / FILE_NAME if path.is_dir() else path
     document = read_json(path)
     sizes = _Sizes(path.parent, images)
@@ -46,12 +58,12 @@ def read(path: Path, images: Sequence[Path] = ()) -> list[Camera]:
         with error_context(f"frames[{index}]"):
             name = image_name(frame, "file_path")
         with error_context(f"frames[{index}] ({name})"):
-            settings = ChainMap(frame, document)  # a frame's own values go before those of all
+            settings = ChainMap(frame, document)  # a frame's fields take precedence
             if "w" in settings or "h" in settings:
                 size = pixels(settings, "w"), pixels(settings, "h")
             elif any(field in frame for field in INTRINSICS):
                 size = sizes.size(name)
-            else:  # intrinsics that are shared imply a size that is: one image is enough to know it
+            else:  # shared intrinsics imply one size, which any image tells
                 size = shared_size = shared_size or sizes.size(name)
             fisheye = _is_fisheye(settings)
             distortion = _distortion(settings, fisheye)
@@ -61,10 +73,10 @@ def read(path: Path, images: Sequence[Path] = ()) -> list[Camera]:
 
 
 def write(path: Path, cameras: Sequence[Camera]) -> None:
-    """Write a transforms.json in which every frame has its own intrinsics.
+    """Write a transforms.json with intrinsics in every frame.
 
-    Raises InputError if a camera's distortion has more coefficients than the format knows, or the folder cannot be
-    written.
+    Raises InputError if a camera has more distortion coefficients than the format allows, or the folder is not
+    writable.
     """
     frames = [_frame(camera) for camera in cameras]
     with atomic_write(path) as temporary:
@@ -75,10 +87,10 @@ def _is_fisheye(settings: Mapping[str, Any]) -> bool:
     model = settings.get("camera_model", "OPENCV")
     if not isinstance(model, str) or model not in PERSPECTIVE_MODELS | {FISHEYE_MODEL}:
         expected = ", ".join(sorted(PERSPECTIVE_MODELS | {FISHEYE_MODEL}))
-        raise InputError(f"camera_model is {shown(model)}, expected one of {expected}; undistort the images first")
+        raise InputError(f"camera_model is {short_repr(model)}, expected one of {expected}; undistort the images first")
     flag = settings.get("is_fisheye", False)
     if not isinstance(flag, bool):
-        raise InputError(f"is_fisheye is {shown(flag)}, expected true or false")
+        raise InputError(f"is_fisheye is {short_repr(flag)}, expected true or false")
     if "distortion_params" in settings:
         raise InputError("distortion_params is not read; write k1, k2, p1, p2, or undistort the images first")
     return flag or model == FISHEYE_MODEL
@@ -95,7 +107,7 @@ def _distortion(settings: Mapping[str, Any], fisheye: bool) -> tuple[float, ...]
             )
     values = tuple(number(settings, field) if field in settings else 0.0 for field in fields)
     if fisheye:
-        return values  # without coefficients a fisheye is still not a pinhole
+        return values  # also if all are zero: a fisheye lens is not a pinhole
     if not any(values):
         return None
     return values if values[-1] else values[:-1]
@@ -120,22 +132,22 @@ def _calibration(settings: Mapping[str, Any], width: int, height: int) -> np.nda
 
 
 def _focal(settings: Mapping[str, Any], field: str, size: int) -> float:
-    """Focal length in pixels of a field of view in radians."""
+    """The focal length in pixels for the field of view in a field: f = size / (2 tan(angle / 2))."""
     angle = number(settings, field)
-    if not NARROWEST_VIEW < angle < math.pi:
-        raise InputError(f"{field} is {angle:g}, expected radians between {NARROWEST_VIEW} and pi")
+    if not MIN_FIELD_OF_VIEW < angle < math.pi:
+        raise InputError(f"{field} is {angle:g}, expected radians between {MIN_FIELD_OF_VIEW} and pi")
     return 0.5 * size / math.tan(0.5 * angle)
 
 
 class _Sizes:
-    """Sizes of images that the file does not tell."""
+    """Sizes of images that the file does not store."""
 
     def __init__(self, folder: Path, images: Sequence[Path]) -> None:
         self.folder, self.images = folder, images
 
     @cached_property
     def _found(self) -> "ImageSizes":
-        from ..image_files import ImageSizes  # loads OpenCV, which few of these files need
+        from ..image_files import ImageSizes  # imports OpenCV, which most of these files do not need
 
         return ImageSizes(self.folder, self.images)
 
@@ -143,7 +155,7 @@ class _Sizes:
         size = self._found.size(name)
         if size is None:
             image = self.folder / name
-            raise InputError(f"w and h are missing, and there is no image {image} to take them from; add w and h")
+            raise InputError(f"w and h are missing, and there is no image {image} that tells them; add w and h")
         return size
 
 
@@ -152,8 +164,8 @@ def _frame(camera: Camera) -> dict[str, Any]:
     coefficients = camera.distortion or ()
     if any(coefficients[len(fields) :]):
         raise InputError(
-            f"{camera.name}: has {len(coefficients)} coefficients of distortion, transforms.json knows "
-            f"{', '.join(fields)}; write this project's own JSON, by another name than {FILE_NAME}"
+            f"{camera.name}: has {len(coefficients)} distortion coefficients, a transforms.json can hold "
+            f"{', '.join(fields)}; choose a file name other than {FILE_NAME} to write this project's own format"
         )
     return {
         "file_path": camera.name,

@@ -269,7 +269,7 @@ def test_names_must_differ(tmp_path, cameras):
         (b"9" * 5000, "not valid JSON"),
         (b"[]", "expected a JSON object"),
         (b"null", "expected a JSON object"),
-        (b"{}", "no cameras here"),
+        (b"{}", "holds no cameras of a known format"),
         (b'{"frames": []}', "frames is .*at least one"),
         (b'{"frames": {"0": 1}}', "frames is .*expected a list"),
         (b'{"frames": [1]}', "frames is .*expected a list"),
@@ -287,7 +287,7 @@ def test_files_that_hold_no_cameras(tmp_path, content, expected):
 def test_files_that_cannot_be_read(tmp_path):
     with pytest.raises(InputError, match=r"nowhere\.json: cannot be read"):
         read_cameras(tmp_path / "nowhere.json")
-    with pytest.raises(InputError, match="is a folder without"):
+    with pytest.raises(InputError, match="is a folder without cameras"):
         read_cameras(tmp_path)
     with pytest.raises(InputError, match="is a folder"):
         read_cameras(tmp_path, camera_format=CameraFormat.OWN)

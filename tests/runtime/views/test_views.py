@@ -204,10 +204,10 @@ import resource, sys
 import numpy as np
 sys.path.insert(0, sys.argv[1])
 from capture_cases import at, captures
-from idesplat.runtime.views.selection import choose_views
+from idesplat.runtime.views.selection import select_views
 cameras = at(captures(10_000)["orbit"])
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-assert len(choose_views(cameras, 3)) == 3
+assert len(select_views(cameras, 3)) == 3
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
 """
     pytest.importorskip("resource")
