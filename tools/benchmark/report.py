@@ -1,4 +1,4 @@
-"""What a benchmark found: its rows, tables of them, the JSON file, and what became worse since an older one."""
+"""Reports of a benchmark: rows, tables, the JSON file, and the comparison with an earlier one."""
 
 import json
 from collections.abc import Sequence
@@ -16,9 +16,9 @@ from ...runtime.errors import InputError
 from ...runtime.system.files import read_bytes
 
 VERSION = 2  # of the JSON's layout; version 1 had no such field
-WIDTH = 150  # columns, where there is no terminal to ask
+WIDTH = 150  # columns, where the output is no terminal
 SHOWN = 7  # operators of a row
-# Runs of the same thing may differ by this factor, whatever their spread says.
+# Medians within this factor are not a regression, whatever the spread.
 TOLERANCE = 1.05
 
 
@@ -47,37 +47,37 @@ class Row:
     roofline_flop: int | None = None
     operators: dict[str, float] = field(default_factory=dict)
     stages: dict[str, float] = field(default_factory=dict)
-    # Why there is nothing of the above.
+    # Why measurements are missing.
     problem: str | None = None
 
     @property
     def name(self) -> str:
-        """What it is, in words."""
+        """The row's title."""
         return f"{self.model} ({self.precision}) on {self.provider}, {self.views} views {self.height}x{self.width}"
 
     @property
     def key(self) -> tuple:
-        """What makes rows of two benchmarks the same."""
+        """Identifies the same row of two benchmarks."""
         return self.model, self.preset, self.precision, self.provider, self.views, self.height, self.width
 
     @property
     def effort(self) -> np.ndarray:
-        """FLOP that the machine could have done in each run: a time that does not depend on how fast it is just now."""
+        """Each run's time in FLOP of the GEMM reference of its round, so that the machine's current speed cancels."""
         return np.multiply(self.seconds, self.gemm_rates)
 
     @property
     def to_eager(self) -> float | None:
-        """Time over eager PyTorch's, the median over the rounds."""
+        """Time relative to eager PyTorch, the median over the rounds."""
         return float(np.median(np.divide(self.seconds, self.eager_seconds))) if self.eager_seconds else None
 
     @property
     def to_roofline(self) -> float | None:
-        """Time over the roofline: that of its FLOP at the rate of the GEMM reference, the median over the rounds."""
+        """Time relative to the roofline: the graph's FLOP at the rate of the GEMM reference; median over the rounds."""
         return float(np.median(self.effort) / self.roofline_flop) if self.roofline_flop and self.seconds else None
 
 
 def print_rows(rows: Sequence[Row]) -> None:
-    """The table of times and memory, then where the time went."""
+    """Print the table of times and memory, then that of the time's shares by operator and stage."""
     table = Table()
     for name in ("model", "precision", "on", "views", "size"):
         table.add_column(name, no_wrap=True)
@@ -99,7 +99,7 @@ def print_rows(rows: Sequence[Row]) -> None:
 
 
 def write_rows(path: Path, machine: dict[str, Any], rows: Sequence[Row]) -> None:
-    """Write everything that was measured as JSON."""
+    """Write the machine and all rows as JSON."""
     content = {"version": VERSION, "machine": machine, "rows": [asdict(row) for row in rows]}
     write_json(path, json.dumps(content, indent=1))
 
@@ -118,17 +118,17 @@ def read_rows(path: Path) -> list[Row]:
 
 
 def compare(rows: Sequence[Row], before: Sequence[Row]) -> list[str]:
-    """Print what changed since an older benchmark; the names of what became worse by more than noise.
+    """Print the changes since an earlier benchmark; returns a line for each regression.
 
-    Times are compared in units of the machine's own speed in the same rounds. Slower is what is so in the median by
-    more than a twentieth, and in three quarters of the runs than in three quarters of the older ones.
+    Times are relative to the GEMM reference of the same rounds. A row is slower if its median is more than 5 % higher
+    and its first quartile is above the earlier third quartile. Memory regresses by more than 5 %.
     """
     known = {row.key: row for row in before if row.seconds}
-    table = Table(title="since then", title_justify="left")
+    table = Table(title="changes", title_justify="left")
     table.add_column("model")
     for name in ("time", "memory"):
         table.add_column(name, justify="right")
-    table.add_column("")
+    table.add_column("regression")
     worse = []
     for row in rows:
         old = known.get(row.key)
@@ -144,7 +144,7 @@ def compare(rows: Sequence[Row], before: Sequence[Row]) -> list[str]:
 
 
 def _verdicts(row: Row, old: Row) -> list[str]:
-    """In what a row is worse than it was."""
+    """The regressions of a row: slower, more memory."""
     verdicts = []
     slower = np.median(row.effort) > TOLERANCE * np.median(old.effort)
     if slower and np.percentile(row.effort, 25) > np.percentile(old.effort, 75):
@@ -155,7 +155,7 @@ def _verdicts(row: Row, old: Row) -> list[str]:
 
 
 def _numbers(row: Row) -> list[str]:
-    """A row's cells from the seconds on."""
+    """A row's cells from the column seconds on."""
     low, median, high = np.percentile(row.seconds, (25, 50, 75))
     return [
         f"{median:.3g}",

@@ -1,4 +1,4 @@
-"""What competes in a benchmark, each in a fresh process: its memory is its own, and it sleeps while others run."""
+"""Candidates of a benchmark, each in a fresh process: its peak memory is its own, and it waits while others run."""
 
 import json
 import multiprocessing
@@ -23,16 +23,16 @@ GEMM_FLOP = 2 * GEMM_SIDE**3
 GEMM_REPEATS = 3
 TIMES_PROFILED = 2
 NODE_SUFFIX = "_kernel_time"
-# Operators whose time is that of others inside them.
+# Operators whose time includes that of their subgraphs' operators.
 LOOPS = ("Scan", "Loop", "If")
-# Operators whose FLOP are counted, as a graph has them before it is optimised.
+# Operators whose FLOP are counted, in the graph before optimisation.
 MATMULS = ("MatMul", "MatMulInteger", "Gemm", "Conv", "ConvTranspose")
 RUN = "run"
 
 
 @dataclass(frozen=True)
 class Workload:
-    """How many views of what size."""
+    """Number and size of the views."""
 
     views: int
     height: int
@@ -40,24 +40,24 @@ class Workload:
 
 
 class Run(NamedTuple):
-    """One run of a candidate: its seconds, and what it gave."""
+    """One run of a candidate: its seconds, and its result."""
 
     seconds: float
     result: Any
 
 
 class Failed(Exception):
-    """A candidate cannot compete; the message says why."""
+    """A candidate cannot run; the message says why."""
 
 
 Prepared = tuple[Any, Callable[[], Any]]
 
 
 class Worker:
-    """A candidate in its process, seen from the process that measures."""
+    """A candidate's process, as the measuring process sees it."""
 
     def __init__(self, prepare: Callable[..., Prepared], *arguments: Any) -> None:
-        """Have `prepare` make ready what is to be run, and keep in `about` what it says of it. Raises Failed."""
+        """Call `prepare` in a new process; `about` holds the first of its results, the second is run. Raises Failed."""
         context = multiprocessing.get_context("spawn")
         self._pipe, other = context.Pipe()
         self._process = context.Process(target=_serve, args=(other, prepare, arguments), daemon=True)
@@ -72,7 +72,7 @@ class Worker:
         return self._answer()
 
     def finish(self) -> int | None:
-        """End the process; the most bytes of memory that it held, where the system tells. Raises Failed."""
+        """End the process; returns its peak memory in bytes, None where the system does not tell. Raises Failed."""
         self._pipe.send(None)
         peak = self._answer()
         self._process.join()
@@ -82,7 +82,7 @@ class Worker:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End the process, whatever it does."""
+        """End the process, in whatever state."""
         self._process.kill()
         self._process.join()
 
@@ -98,8 +98,8 @@ class Worker:
 
 
 def _serve(pipe: Connection, prepare: Callable[..., Prepared], arguments: tuple) -> None:
-    """A candidate's process: runs whenever it is told to."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # who measures decides when to stop
+    """The candidate's process: runs on request."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the measuring process decides when to stop
     try:
         about, run = prepare(*arguments)
         pipe.send(about)
@@ -108,15 +108,15 @@ def _serve(pipe: Connection, prepare: Callable[..., Prepared], arguments: tuple)
             result = run()
             pipe.send(Run(time.perf_counter() - started, result))
         pipe.send(peak_bytes())
-    except EOFError:  # who measures is gone
+    except EOFError:  # the measuring process is gone
         pass
     except Exception as error:
         pipe.send(Failed(" ".join(str(error).split()) or type(error).__name__))
 
 
 def peak_bytes() -> int | None:
-    """The most memory that this process held."""
-    try:  # getrusage would count the parent's, whose copy this process was for a moment
+    """Peak resident memory of this process in bytes."""
+    try:  # getrusage would include the parent's, of which this process was a fork
         status = Path("/proc/self/status").read_text()
         return int(status.partition("VmHWM:")[2].split()[0]) * 1024
     except (OSError, IndexError):
@@ -128,13 +128,13 @@ def peak_bytes() -> int | None:
     return None
 
 
-# ---- candidates: what they say of themselves, and what is run
+# ---- candidates: what `about` holds, and what is run
 
 
 def gemm() -> Prepared:
     """The GEMM reference: the product of two large matrices in NumPy; a run gives FLOP per second.
 
-    The environment says how many threads NumPy takes: it has no other way.
+    The number of NumPy's threads comes from the environment.
     """
     left, right = np.random.default_rng(0).random((2, GEMM_SIDE, GEMM_SIDE), np.float32)
 
@@ -149,14 +149,14 @@ def gemm() -> Prepared:
 
 
 def describe(model: Path) -> Prepared:
-    """What a model's file says of itself."""
+    """A model's metadata."""
     from ...runtime.inference.model_files import read_model
 
     return asdict(read_model(model).metadata), dict
 
 
 def exported(model: Path, provider: str, threads: int, workload: Workload) -> Prepared:
-    """An exported model; `about` holds how long it took to open, and the depth that it predicts."""
+    """An exported model; `about` holds the seconds to open it, and its predicted depth."""
     from ...runtime.inference.predictor import Predictor
     from ...runtime.inference.session import SessionConfig
 
@@ -173,7 +173,7 @@ def exported(model: Path, provider: str, threads: int, workload: Workload) -> Pr
 
 
 def eager(preset: str, threads: int, workload: Workload) -> Prepared:
-    """A preset's network in PyTorch, with weights drawn at random: its time does not depend on them."""
+    """A preset's network in eager PyTorch with initial weights; its time does not depend on them."""
     import torch
 
     from ...model.registry import build
@@ -195,9 +195,9 @@ def eager(preset: str, threads: int, workload: Workload) -> Prepared:
 
 
 def analyse(model: Path, provider: str, threads: int, workload: Workload) -> Prepared:
-    """Where a model's time goes and how much it computes, as `about`; there is nothing to run.
+    """Profile a model; `about` holds the result, and there is nothing to run.
 
-    operators, stages: shares of the time, by name. flop: of its products of matrices and its convolutions.
+    operators, stages: shares of the time, by name. flop: of its matmuls and convolutions.
     """
     from ...runtime.inference.session import CPU
 
@@ -216,7 +216,7 @@ def analyse(model: Path, provider: str, threads: int, workload: Workload) -> Pre
 
 
 def example_arrays(workload: Workload, near: float, far: float) -> tuple[np.ndarray, ...]:
-    """Images of coarse noise and cameras on a line, as a model's inputs in their order."""
+    """A model's inputs in their order: images of coarse noise, and cameras on a line."""
     views, height, width = workload.views, workload.height, workload.width
     rng = np.random.default_rng(0)
     coarse = rng.random((views, 3, height // 8 + 1, width // 8 + 1), np.float32)
@@ -229,7 +229,7 @@ def example_arrays(workload: Workload, near: float, far: float) -> tuple[np.ndar
 
 
 def _profile(model: Path, provider: str, threads: int, workload: Workload, optimise: bool) -> list[dict[str, Any]]:
-    """ONNX Runtime's notes on every operator of a run; where it is optimised, of one that is not the first."""
+    """ONNX Runtime's profile of every operator of a run; of an optimised graph, of its second run."""
     from ...runtime.inference.predictor import Predictor
     from ...runtime.inference.session import SessionConfig
     from ...runtime.system.files import scratch_folder
@@ -243,14 +243,14 @@ def _profile(model: Path, provider: str, threads: int, workload: Workload, optim
 
 
 def last_kernels(profile: Path) -> list[dict[str, Any]]:
-    """The notes on the operators of the last run in a file that ONNX Runtime wrote."""
+    """The operators of the last run in a profile that ONNX Runtime wrote."""
     events = json.loads(profile.read_text())
     last = max(event["ts"] for event in events if event["name"] == "model_run")
     return [event for event in events if event["name"].endswith(NODE_SUFFIX) and event["ts"] >= last]
 
 
 def flop_of(args: dict[str, Any]) -> int:
-    """Floating-point operations of one operator, from the shapes in ONNX Runtime's notes."""
+    """Floating-point operations of one operator, from the shapes in ONNX Runtime's profile."""
     operator = args["op_name"]
     if operator not in MATMULS:
         return 0
@@ -265,6 +265,6 @@ def flop_of(args: dict[str, Any]) -> int:
 
 
 def _shares(times: Counter[str]) -> dict[str, float]:
-    """Each name's share of the whole, largest first."""
+    """Each name's share of the total, largest first."""
     whole = sum(times.values()) or 1
     return {name: time / whole for name, time in times.most_common()}

@@ -1,4 +1,4 @@
-"""What is evaluated: views that a network is given, and views that it is to meet."""
+"""Evaluation cases: context views for a network, and held-out target views."""
 
 from dataclasses import dataclass
 
@@ -7,19 +7,19 @@ import numpy as np
 from ...runtime.geometry.consistency import project_to_view
 from ...runtime.splats.points import unproject
 
-# Depths that differ by less than this share are of one surface.
+# Relative difference of depths of the same surface.
 SAME_SURFACE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class PosedImages:
-    """Images with their cameras at the network's size.
+    """Images with their cameras, at the network's size.
 
     names: of the images, [views].
     images: float32 RGB in [0, 1], [views, 3, height, width].
     extrinsics: camera-to-world, OpenCV axes, [views, 4, 4].
     intrinsics: row 0 divided by the width, row 1 by the height, [views, 3, 3].
-    valid: bool, [views, height, width]; False where the camera saw nothing and the image was filled.
+    valid: bool, [views, height, width]; False where undistortion filled the image with no data.
     """
 
     names: list[str]
@@ -43,12 +43,12 @@ class PosedImages:
 
 @dataclass(frozen=True, eq=False)
 class EvalCase:
-    """Context views for a network, and target views of the same scene that it does not see.
+    """Context views for a network, and held-out target views of the same scene.
 
     near, far: the depth range, in scene units. depth: true z-depth of the context views in scene units,
-    [views, height, width], not positive where unknown; None where there is none.
-    covisible: whether some context view sees the surface that a target's pixel shows, bool [targets, height, width];
-    None where that is not known.
+    [views, height, width], not positive where unknown; None without ground truth.
+    covisible: whether some context view sees the surface at a target's pixel, bool [targets, height, width]; None
+    without ground truth.
     """
 
     name: str
@@ -61,17 +61,17 @@ class EvalCase:
 
 
 def synthetic_case(
-    seed: int, context: int, pool: int, targets: int, height: int, width: int, closer: int = 1
+    seed: int, context: int, pool: int, targets: int, height: int, width: int, zoom: int = 1
 ) -> EvalCase:
-    """The procedural scene of `seed`, with exact depth; the same arguments give the same case.
+    """The synthetic scene of a seed, with exact depth; the same arguments give the same case.
 
     pool: context views rendered along a path, of which `context` are given to the network, evenly spaced.
-    closer: how many times as large targets are rendered as the context; they are windows of such images then.
+    zoom: targets are crops of images rendered this many times as large as the context's.
     """
     from ..synthetic.sampler import generate_sample
 
-    sample = generate_sample(seed, pool, targets, height, width, target_zooms=(closer,) * targets)
-    given = np.linspace(0, pool - 1, context).round().astype(int)
+    sample = generate_sample(seed, pool, targets, height, width, target_zooms=(zoom,) * targets)
+    chosen = np.linspace(0, pool - 1, context).round().astype(int)
 
     def posed(kind: str, views: np.ndarray | slice) -> PosedImages:
         images = sample.images[views]
@@ -79,14 +79,17 @@ def synthetic_case(
         valid = np.ones((len(images), height, width), bool)
         return PosedImages(names, images, sample.extrinsics[views], sample.intrinsics[views], valid)
 
-    chosen, met = posed("context", given), posed("target", slice(pool, None))
-    depth = sample.depth[given]
-    covisible = find_covisible(unproject(sample.depth[pool:], met.extrinsics, met.intrinsics), depth, chosen)
-    return EvalCase(str(seed), chosen, met, sample.near, sample.far, depth, covisible)
+    given, held_out = posed("context", chosen), posed("target", slice(pool, None))
+    depth = sample.depth[chosen]
+    covisible = find_covisible(unproject(sample.depth[pool:], held_out.extrinsics, held_out.intrinsics), depth, given)
+    return EvalCase(str(seed), given, held_out, sample.near, sample.far, depth, covisible)
 
 
 def find_covisible(points: np.ndarray, depth: np.ndarray, views: PosedImages) -> np.ndarray:
-    """Whether some view sees points [..., 3], from the views' true z-depth [views, height, width]."""
+    """Whether some view sees points [..., 3] in world coordinates, bool [...].
+
+    depth: the views' true z-depth, [views, height, width]. A point is seen where it agrees with a view's depth.
+    """
     seen = np.zeros(points.shape[:-1], bool)
     for surface, extrinsics, intrinsics in zip(depth, views.extrinsics, views.intrinsics, strict=True):
         pixel, z, inside = project_to_view(points, surface.shape, extrinsics, intrinsics)

@@ -1,4 +1,4 @@
-"""One case through an exported model: its target views rendered and measured beside what other methods make of them."""
+"""Evaluation of one case: target views rendered from a model's Gaussians, and compared with the baselines."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,21 +20,21 @@ from .metrics import LPIPS, depth_measures, psnr, ssim
 MODEL, NEAREST, ORACLE_PLANE, ORACLE_DEPTH = "model", "nearest", "oracle_plane", "oracle_depth"
 # Default near plane of target renderings, in scene units.
 NEAR_PLANE = 0.01
-# A mean difference of the colours from here on has the brightest colour.
-WORST_ERROR = 0.3
-# Where less of the light is stopped, there is no depth to show.
-LEAST_ALPHA = 0.05
+# Mean absolute colour error at the top of the error image's colour map.
+MAX_ERROR = 0.3
+# No depth is shown below this alpha.
+MIN_ALPHA = 0.05
 GAP = 4  # white pixels between the images of a strip
 
-# Values by method and measure.
+# Metrics by method.
 Scores = dict[str, dict[str, float]]
 
 
 @dataclass(frozen=True)
 class Target:
-    """The measures of a target view, by method and measure.
+    """Metrics of a target view by method.
 
-    details: what the other methods found, the nearest view's name and the plane's depth in scene units.
+    details: `nearest_view`, its name, and `oracle_plane_depth` in scene units.
     """
 
     name: str
@@ -44,7 +44,7 @@ class Target:
 
 @dataclass(frozen=True)
 class Result:
-    """What was measured of a case; depth: AbsRel and its like, where the context's depth is known."""
+    """Metrics of a case; depth: AbsRel, delta < 1.25 and inlier ratio, where the context's true depth is known."""
 
     name: str
     context: list[str]
@@ -56,9 +56,9 @@ class Result:
 
 @dataclass(frozen=True)
 class Evaluator:
-    """A model and how it is measured.
+    """Evaluates a model on cases.
 
-    lpips: the measure, where it is there. compare: whether other methods are measured, too.
+    lpips: None where it cannot be computed. compare: whether the baselines are evaluated, too.
     near_plane: of target renderings, in scene units.
     """
 
@@ -68,10 +68,10 @@ class Evaluator:
     near_plane: float = NEAR_PLANE
 
     def evaluate(self, case: EvalCase, show: Callable[[str, np.ndarray], None] | None = None) -> Result:
-        """Predict from the context, render the targets and measure them.
+        """Predict from the context, render the targets and compute their metrics.
 
-        show: is given each target's name and strip: truth, render, error, depth and, if measured, the plane; RGB in
-        [0, 1], [height, all widths, 3]. Raises InputError for what the model cannot take.
+        show: receives each target's name and strip: truth, render, error, depth and, if evaluated, the oracle plane,
+        side by side, RGB in [0, 1]. Raises InputError for a case that the model cannot take.
         """
         given = case.context
         prediction = self.predictor.predict_arrays(
@@ -87,8 +87,8 @@ class Evaluator:
             images: dict[str, np.ndarray] = {MODEL: rendering.rgb}
             details: dict[str, Any] = {}
             if self.compare:
-                others, details = self._others(case, view, exact)
-                images |= others
+                baselines, details = self._baselines(case, view, exact)
+                images |= baselines
             covisible = None if case.covisible is None else case.covisible[view] & valid
             scores = {method: self._measure(image, truth, valid, covisible) for method, image in images.items()}
             targets.append(Target(name, scores, details))
@@ -97,10 +97,10 @@ class Evaluator:
         depth = {} if case.depth is None else depth_measures(prediction.depth, case.depth)
         return Result(case.name, given.names, case.near, case.far, targets, depth)
 
-    def _others(
+    def _baselines(
         self, case: EvalCase, view: int, exact: Gaussians | None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Other methods' images of a target, [height, width, 3], and what they found; exact: splats at true depth."""
+        """The baselines' images of a target, [height, width, 3], and details; exact: oracle-depth splats."""
         context, targets, pose = case.context, case.targets, case.targets.extrinsics[view]
         copied = nearest_view(context, pose)
         truth, valid = targets.image(view), targets.valid[view]
@@ -122,19 +122,19 @@ class Evaluator:
 
 
 def mean_of_views(results: Sequence[Result]) -> Scores:
-    """The mean of every method's measures over all target views; those of depth, over the scenes, are the model's."""
+    """Metrics of every method averaged over all target views; depth metrics of the model averaged over the scenes."""
     means = _mean([target.scores for result in results for target in result.targets])
     means[MODEL] |= _mean([{MODEL: result.depth} for result in results])[MODEL]
     return means
 
 
 def mean_of_scenes(results: Sequence[Result]) -> Scores:
-    """As the papers count: the mean over the scenes of their means over the target views."""
+    """As in the papers: the mean over scenes of each scene's mean over its target views."""
     return _mean([mean_of_views([result]) for result in results])
 
 
 def render_target(gaussians: Gaussians, targets: PosedImages, view: int, near_plane: float = NEAR_PLANE) -> Rendering:
-    """The Gaussians from a target camera at its image's size, on black."""
+    """Render Gaussians from a target camera at its image's size, on black; near_plane in scene units."""
     height, width = targets.images.shape[2:]
     return rasterize(
         gaussians.means,
@@ -151,7 +151,7 @@ def render_target(gaussians: Gaussians, targets: PosedImages, view: int, near_pl
 
 
 def _mean(entries: list[Scores]) -> Scores:
-    """The mean of entries that all have the same methods and measures."""
+    """The mean of entries with the same methods and metrics."""
     return {
         method: {measure: float(np.mean([entry[method][measure] for entry in entries])) for measure in measures}
         for method, measures in entries[0].items()
@@ -161,10 +161,10 @@ def _mean(entries: list[Scores]) -> Scores:
 def comparison_strip(
     truth: np.ndarray, valid: np.ndarray, rendering: Rendering, plane: np.ndarray | None
 ) -> np.ndarray:
-    """Truth, render, error (black where nothing is measured), depth and plane side by side."""
-    error = np.abs(rendering.rgb.clip(0, 1) - truth).mean(axis=2) * valid / WORST_ERROR
+    """Truth, render, error (black at invalid pixels), depth and oracle plane side by side, [height, all widths, 3]."""
+    error = np.abs(rendering.rgb.clip(0, 1) - truth).mean(axis=2) * valid / MAX_ERROR
     hot = cv2.applyColorMap(np.rint(255 * error.clip(0, 1)).astype(np.uint8), cv2.COLORMAP_INFERNO)
-    depth = np.where(rendering.alpha > LEAST_ALPHA, rendering.depth / np.maximum(rendering.alpha, LEAST_ALPHA), 0)
+    depth = np.where(rendering.alpha > MIN_ALPHA, rendering.depth / np.maximum(rendering.alpha, MIN_ALPHA), 0)
     images = [truth, rendering.rgb, hot[..., ::-1].astype(np.float32) / 255, colormap_depth(depth)]
     if plane is not None:
         images.append(plane)

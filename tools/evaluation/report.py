@@ -27,30 +27,30 @@ TITLES = {
     "inlier_ratio_1.05": "inlier ratio at 1.05",
 }
 DECIMALS = {"psnr": 2, "psnr_covisible": 2}
-USUAL_DECIMALS = 3
+DEFAULT_DECIMALS = 3
 METHODS = {MODEL: "model", NEAREST: "nearest", ORACLE_PLANE: "oracle plane", ORACLE_DEPTH: "oracle depth"}
-WIDTH = 130  # columns, where there is no terminal to ask
+WIDTH = 130  # columns, where the output is no terminal
 
 
 def print_views(results: Sequence[Result]) -> None:
-    """A row for each target view, with every method's measures."""
+    """Print a row for each target view, with every method's metrics."""
     scores = results[0].targets[0].scores
-    columns = [(measure, method) for measure in scores[MODEL] for method in scores]
+    columns = [(metric, method) for metric in scores[MODEL] for method in scores]
     table = Table()
     table.add_column("target", no_wrap=True)
     table.add_column("from")
-    for measure, method in columns:
-        heading = TITLES[measure] if method == MODEL else ""
+    for metric, method in columns:
+        heading = TITLES[metric] if method == MODEL else ""
         table.add_column(f"{heading}\n{METHODS[method]}", justify="right", no_wrap=True)
     for result in results:
         for target in result.targets:
-            cells = [_number(measure, target.scores[method][measure]) for measure, method in columns]
+            cells = [_number(metric, target.scores[method][metric]) for metric, method in columns]
             table.add_row(literal(target.name), literal(", ".join(result.context)), *cells)
     print_table(table)
 
 
 def print_means(means: Scores, title: str) -> None:
-    """A title, then a row for each measure's mean, a column for each method, and what the model gains."""
+    """Print a title and a row for each metric: its mean by method, and the model's difference to each baseline."""
     table = Table()
     table.add_column("mean")
     for method in means:
@@ -58,11 +58,11 @@ def print_means(means: Scores, title: str) -> None:
     compared = [method for method in means if method != MODEL]
     for method in compared:
         table.add_column(f"over {METHODS[method]}", justify="right")
-    for measure, value in means[MODEL].items():
-        others = [means[method].get(measure) for method in compared]
-        cells = ["" if other is None else _number(measure, other) for other in others]
-        gains = ["" if other is None else _number(measure, value - other, sign="+") for other in others]
-        table.add_row(TITLES[measure], _number(measure, value), *cells, *gains)
+    for metric, value in means[MODEL].items():
+        others = [means[method].get(metric) for method in compared]
+        cells = ["" if other is None else _number(metric, other) for other in others]
+        gains = ["" if other is None else _number(metric, value - other, sign="+") for other in others]
+        table.add_row(TITLES[metric], _number(metric, value), *cells, *gains)
     say(title)
     print_table(table)
 
@@ -95,12 +95,12 @@ def write_json(folder: Path, content: dict[str, Any]) -> Path:
     return path
 
 
-def _number(measure: str, value: float, sign: str = "") -> str:
-    return f"{value:{sign}.{DECIMALS.get(measure, USUAL_DECIMALS)}f}"
+def _number(metric: str, value: float, sign: str = "") -> str:
+    return f"{value:{sign}.{DECIMALS.get(metric, DEFAULT_DECIMALS)}f}"
 
 
 def print_table(table: Table) -> None:
-    """Print a table, at a set width where there is no terminal."""
+    """Print a table, at a fixed width where the output is no terminal."""
     console = Console()
     if not console.is_terminal:
         console = Console(width=WIDTH)

@@ -107,7 +107,7 @@ class LoadedFrame:
 
 
 class CaptureImages:
-    """The images of a capture that lie in a folder, each loaded once at the network's size.
+    """A capture's images in a folder, each loaded once at the network's size.
 
     folder: contains the capture's frames under their names. size: height and width.
     """

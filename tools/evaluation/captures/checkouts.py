@@ -1,4 +1,4 @@
-"""Images of public git repositories at pinned commits, from checkouts that are there, or cloned on demand."""
+"""Files of public git repositories at pinned commits, from existing checkouts or clones made on demand."""
 
 import os
 import subprocess
@@ -14,7 +14,7 @@ GIT_FOLDER = ".git"
 
 
 def clones_folder() -> Path:
-    """Where captures are cloned if no folder is given: in our own folder in the user's cache."""
+    """The default folder for clones: captures in idesplat's folder of the user's cache."""
     given = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
     return (Path(given) if given else Path.home() / ".cache") / "idesplat" / CLONES
 
@@ -29,17 +29,17 @@ def find_checkout(folder: Path, repository: str) -> Path | None:
 
 
 def fetch_checkout(folder: Path, repository: str, commit: str, host: str = HOST) -> Path:
-    """The checkout of OWNER/NAME in the folder, which is made by fetching the commit from `host` if it is not there.
+    """The checkout of OWNER/NAME in a folder; a missing one is fetched from `host`.
 
-    A checkout that is there is not changed. Of a fetched one, git fetches each file when it is read.
-    Raises InputError where git or the network fails, or a checkout that is there lacks the commit.
+    Existing checkouts are not changed. Git fetches the files of a fetched one when they are read (a partial clone).
+    Raises InputError where git or the network fails, or an existing checkout lacks the commit.
     """
     found = find_checkout(folder, repository)
     if found is not None:
         _git(found, "cat-file", "-e", f"{commit}^{{commit}}")
         return found
     target = folder / repository.replace("/", "+")
-    # A fetch that fails or is killed must not leave what looks like a checkout.
+    # A fetch that fails or is killed must not leave a folder that looks like a checkout.
     with scratch_folder(make_folder(folder)) as scratch:
         fetched = make_folder(scratch / target.name)
         _git(fetched, "init", "--quiet", "--bare")
@@ -49,9 +49,9 @@ def fetch_checkout(folder: Path, repository: str, commit: str, host: str = HOST)
 
 
 def extract(checkout: Path, commit: str, folder: str, names: Sequence[str], into: Path) -> None:
-    """Write files of a folder in the commit into another folder under their names; raises InputError.
+    """Write files of a folder of the commit into another folder under the same names; raises InputError.
 
-    The commit is read, not the work tree: a file that was changed since has no effect.
+    The commit is read, not the work tree, so local changes have no effect.
     """
     for name in names:
         content = _git(checkout, "cat-file", "blob", f"{commit}:{folder and folder + '/'}{name}")

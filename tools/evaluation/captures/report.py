@@ -16,7 +16,7 @@ from .scores import PAIRS, CaptureScores, mean_of_captures
 if TYPE_CHECKING:
     from ..evaluate import CaptureEvaluation
 
-# Heading, method and measure of a column of means.
+# Heading, method and metric of a column of means.
 COLUMNS = (
     ("PSNR", MODEL, "psnr"),
     ("fitted", MODEL, "psnr_fitted"),
@@ -74,5 +74,5 @@ def write_capture_results(folder: Path, result: "CaptureEvaluation") -> Path:
 
 
 def _cells(means: Scores) -> list[str]:
-    values = [(measure, means.get(method, {}).get(measure)) for _, method, measure in COLUMNS]
-    return ["" if value is None else f"{value:.{DECIMALS.get(measure, 2)}f}" for measure, value in values]
+    values = [(metric, means.get(method, {}).get(metric)) for _, method, metric in COLUMNS]
+    return ["" if value is None else f"{value:.{DECIMALS.get(metric, 2)}f}" for metric, value in values]

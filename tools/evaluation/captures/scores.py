@@ -1,4 +1,4 @@
-"""One capture through an exported model: held-out frames rendered from pairs and from several views, and measured."""
+"""Evaluation of one capture: held-out frames rendered from pairs of views and from longer windows of views."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -15,14 +15,14 @@ from ..metrics import LPIPS, fit_exposure, psnr, ssim
 from ..novel_views import MODEL, NEAREST, ORACLE_PLANE, Scores, comparison_strip, render_target
 from .capture import PAIR, Capture, CaptureImages
 
-PAIRS = "pairs"  # the model's result from the two views around each held-out frame
+PAIRS = "pairs"  # method: the model given the two views around each held-out frame
 
 Show = Callable[[str, np.ndarray], None]
 
 
 @dataclass(frozen=True)
 class TargetScores:
-    """The measures of a held-out frame, by method and measure."""
+    """The metrics of a held-out frame, by method and metric."""
 
     name: str
     scores: Scores
@@ -40,29 +40,26 @@ class CaseScores:
 
 @dataclass(frozen=True)
 class CaptureScores:
-    """The measures of a capture, by the number of context views; without numbers that it has too few views for."""
+    """The metrics of a capture, by the number of context views; without numbers that it has too few views for."""
 
     name: str
     kind: str
     cases: dict[int, list[CaseScores]] = field(default_factory=dict)
 
     def mean(self, count: int) -> Scores:
-        """The mean over the held-out frames by method and measure, and of `input_psnr` over the cases."""
+        """The mean over the held-out frames by method and metric, and of `input_psnr` over the cases."""
         cases = self.cases[count]
         targets = [target.scores for case in cases for target in case.targets]
         means = {
-            method: {name: float(np.mean([scores[method][name] for scores in targets])) for name in measures}
-            for method, measures in targets[0].items()
+            method: {name: float(np.mean([scores[method][name] for scores in targets])) for name in metrics}
+            for method, metrics in targets[0].items()
         }
         means[MODEL]["input_psnr"] = float(np.mean([case.input_psnr for case in cases]))
         return means
 
 
 class CaptureEvaluator:
-    """Measures a model on captures.
-
-    lpips: the measure, where it is installed.
-    """
+    """Evaluates a model on captures; lpips: None where it cannot be computed."""
 
     def __init__(self, predictor: Predictor, lpips: LPIPS | None) -> None:
         self.predictor, self.lpips = predictor, lpips
@@ -72,9 +69,9 @@ class CaptureEvaluator:
     ) -> CaptureScores:
         """The capture's triples if `counts` has 2, and its middle views for every other number of views.
 
-        Beside the held-out frames of those stand the nearest view and the best fronto-parallel plane (oracle), both of
-        the two views around each frame, and the model's own result from these two.
-        show: is given a name and a strip for each held-out frame: truth, render, error, depth and plane.
+        Windows of views are compared with the nearest view and the best fronto-parallel plane (oracle) of the two views
+        around each held-out frame, and with the model given these two.
+        show: receives a name and a strip for each held-out frame: truth, render, error, depth and plane.
         Raises InputError for what the model cannot take.
         """
         result = CaptureScores(capture.name, capture.kind)
@@ -99,7 +96,7 @@ class CaptureEvaluator:
         return result
 
     def _triple(self, case: EvalCase, show: Show | None) -> CaseScores:
-        """A pair of views and one held-out frame, beside what other methods make of it."""
+        """Evaluate a pair of views and one held-out frame, with the baselines."""
         gaussians, seconds = self._predict(case)
         pose, K = case.targets.extrinsics[0], case.targets.K(0)
         truth, valid = case.targets.image(0), case.targets.valid[0]
@@ -118,7 +115,7 @@ class CaptureEvaluator:
         )
 
     def _window(self, case: EvalCase, pairs: dict[str, Scores], show: Show | None) -> CaseScores:
-        """Several views and the held-out frames between them; pairs: the scores of each frame from its neighbours."""
+        """Evaluate several views and the held-out frames between them; pairs: each frame's scores from two views."""
         gaussians, seconds = self._predict(case)
         targets = []
         for index, name in enumerate(case.targets.names):
@@ -153,8 +150,8 @@ def mean_of_captures(results: Sequence[CaptureScores], count: int) -> Scores:
     """The mean over the captures that have `count` views, each with the same weight."""
     means = [result.mean(count) for result in results if count in result.cases]
     return {
-        method: {name: float(np.mean([mean[method][name] for mean in means])) for name in measures}
-        for method, measures in means[0].items()
+        method: {name: float(np.mean([mean[method][name] for mean in means])) for name in metrics}
+        for method, metrics in means[0].items()
     }
 
 
