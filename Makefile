@@ -13,7 +13,9 @@ $(VENV)/.ready: pyproject.toml constraints.txt tests/npm/package-lock.json
 	rm -rf build
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[dev]"
-	if command -v npm > /dev/null; then npm ci --prefix tests/npm --silent --no-audit --no-fund; fi
+	if command -v npm > /dev/null; then \
+		npm ci --prefix tests/npm --silent --no-audit --no-fund && \
+		npm install --prefix docs/examples --silent --no-audit --no-fund --no-package-lock; fi
 	mkdir -p .typing/idesplat
 	for part in *.py py.typed model export runtime tools; do ln -sfn ../../$$part .typing/idesplat/$$part; done
 	touch $@
@@ -60,4 +62,4 @@ weights: setup runs/textures
 	$(BIN)/python -P -m idesplat.tools.training.release runs/head/last.ckpt --preset idesplat-lite
 
 clean:
-	rm -rf $(VENV) build site .typing tests/npm/node_modules *.egg-info
+	rm -rf $(VENV) build site .typing tests/npm/node_modules docs/examples/node_modules *.egg-info

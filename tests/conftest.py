@@ -73,9 +73,22 @@ def run_command(main, *arguments) -> int:
     return 0
 
 
+# Fixtures that export a network, which takes half a minute.
+EXPORTS = {"exported", "kept_traces"}
+
+
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip tests of POSIX on Windows, and run the files with slow tests first, so that two processes end together."""
+    """Mark tests by their fixtures, skip those of POSIX on Windows, and run the files with slow tests first.
+
+    With the slow files first, two processes end at about the same time.
+    """
     for item in items:
+        fixtures = set(getattr(item, "fixturenames", ()))
+        if "browser" in fixtures:
+            item.add_marker("browser")
+        if fixtures & EXPORTS or item.get_closest_marker("parity"):
+            item.add_marker("slow")
         if os.name == "nt" and item.get_closest_marker("posix"):
             item.add_marker(pytest.mark.skip(reason="needs POSIX"))
     slow = {item.path for item in items if item.get_closest_marker("slow")}
@@ -114,7 +127,18 @@ def small_checkpoint(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def exported(small_checkpoint, presets, tmp_path_factory) -> tuple[Path, Path]:
+def kept_traces(tmp_path_factory):
+    """From here on, a network is traced once in a run of the tests, however often it is exported."""
+    from idesplat.export import tracing
+    from kept_traces import keeping_trace
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tracing, "trace", keeping_trace(tmp_path_factory))
+        yield
+
+
+@pytest.fixture(scope="session")
+def exported(small_checkpoint, presets, kept_traces, tmp_path_factory) -> tuple[Path, Path]:
     """The small network as a fused file and as a staged folder, through the command."""
     from idesplat.export.cli import main
 

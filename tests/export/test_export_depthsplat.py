@@ -45,7 +45,7 @@ def network(name):
 
 
 @pytest.fixture(scope="module")
-def graphs(tmp_path_factory):
+def graphs(kept_traces, tmp_path_factory):
     """Each network through the command: name -> fused file and staged folder."""
     PRESETS.update(NETWORKS)
     folder = tmp_path_factory.mktemp("depthsplat")

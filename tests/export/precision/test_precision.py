@@ -20,7 +20,7 @@ EXACT = re.compile(
 
 
 @pytest.fixture(scope="module", params=["int8", "fp16"])
-def lowered(request, small_checkpoint, presets, tmp_path_factory):
+def lowered(request, small_checkpoint, presets, kept_traces, tmp_path_factory):
     folder = tmp_path_factory.mktemp(request.param)
     out, staged = folder / "model.onnx", folder / "staged"
     arguments = (small_checkpoint, out, "--staged", staged, "--precision", request.param)

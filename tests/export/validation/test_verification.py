@@ -333,7 +333,7 @@ def test_the_whole_table_has_every_figure_beside_its_bound(capsys):
 
 
 @pytest.fixture(scope="module")
-def prepared(small_checkpoint, presets, tmp_path_factory):
+def prepared(small_checkpoint, presets, kept_traces, tmp_path_factory):
     """The small network's graphs as `export_graphs` leaves them; tracing takes most of an export."""
     from idesplat.export.tracing import export_graphs
     from idesplat.model.registry import PRESETS

@@ -58,6 +58,7 @@ def test_all_strides_and_scales_are_covered():
     assert len(VIEWS) == 3
 
 
+@pytest.mark.parity
 def test_matching_features_of_several_views(views):
     expected, encoded, *_ = views
     reference = expected["features_mv"]
@@ -70,11 +71,13 @@ def check_depth(depth, expected):
     assert error.max() < 1e-3
 
 
+@pytest.mark.parity
 def test_depth_of_several_views(views):
     expected, _, scales, *_ = views
     check_depth(1 / scales[-1].inverse_depth_full[:, 0], expected)
 
 
+@pytest.mark.parity
 def test_depth_of_several_views_in_onnx_runtime(views, tmp_path):
     """The graph is traced at four views and another size."""
     expected, *_, model, inputs = views
@@ -83,6 +86,7 @@ def test_depth_of_several_views_in_onnx_runtime(views, tmp_path):
     check_depth(torch.from_numpy(run_session(open_session(graphs.whole), feeds)["depth"]), expected)
 
 
+@pytest.mark.parity
 def test_upsampled_features(views):
     expected, _, _, features, *_ = views
     reference = expected["features"]

@@ -18,6 +18,8 @@ from parity_cases import DEPTHSPLAT_CASES as CASES
 from parity_cases import as_reference, share_within
 from reference_weights import draw_state_dict, read_arrays, read_meta
 
+pytestmark = pytest.mark.parity
+
 # The stages' tensors that a case holds, the second scale's only where there is one.
 STAGES = ("features_cnn", "features_mv", "scale0.logits", "scale1.logits", "gaussian_raw")
 GAUSSIANS = ("means", "covariances", "opacities", "scales", "sh")

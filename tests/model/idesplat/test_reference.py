@@ -22,6 +22,8 @@ from idesplat.model.registry import PRESETS
 from parity_cases import CASES, as_reference, share_within
 from reference_weights import draw_state_dict, read_arrays, read_meta
 
+pytestmark = pytest.mark.parity
+
 ENCODER = ("features_cnn", "features_mono", "mono_out", "features_mv")
 UNIT = ("inverse_depth_first", "inverse_depth", "features", "probability")
 

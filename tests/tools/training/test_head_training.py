@@ -28,6 +28,8 @@ from idesplat.tools.training.run_files import CHECKPOINT, FEATURES
 from idesplat.tools.training.trainer import Trainer
 from test_train import SETTINGS, SMALL, finished, logged, one_thread, refused
 
+pytestmark = pytest.mark.slow
+
 __all__ = ["finished", "one_thread"]  # fixtures
 CONFIG = replace(SMALL, cross_view_channels=4, scale_in_pixels=True)
 HEAD = replace(SETTINGS, curriculum=False, steps=4, batch=1, part="head", scenes=3)

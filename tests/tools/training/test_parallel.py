@@ -18,6 +18,8 @@ from idesplat.tools.training.run_files import CHECKPOINT, LOG
 from idesplat.tools.training.trainer import train
 from test_train import SETTINGS, SMALL
 
+pytestmark = pytest.mark.slow
+
 TWO_STEPS = replace(SETTINGS, curriculum=False, steps=2, batch=2)
 
 

@@ -1,0 +1,37 @@
+"""Traced networks, kept for further exports of the same network: tracing takes most of an export's time."""
+
+import hashlib
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import onnx
+import pytest
+from idesplat.export import tracing
+from idesplat.export.stages import NamedTensors
+from idesplat.export.tracing import WEIGHTS, StaticShape
+from idesplat.runtime.inference.metadata import ModelMetadata
+from shared_fixtures import build_once
+
+GRAPH = "graph.onnx"
+
+
+def keeping_trace(factory: pytest.TempPathFactory) -> Callable[..., onnx.ModelProto]:
+    """`idesplat.export.tracing.trace`, which copies what it made before of the same network, weights and sizes."""
+    trace = tracing.trace
+
+    def kept(network: NamedTensors, metadata: ModelMetadata, static: StaticShape, folder: Path) -> onnx.ModelProto:
+        sizes = (static, metadata.near, metadata.far, metadata.size_multiple)
+        key = hashlib.sha256(repr((network.model.config, sizes)).encode())
+        for name, value in network.state_dict().items():
+            key.update(name.encode() + value.numpy().tobytes())
+
+        def build(target: Path) -> None:
+            model = trace(network, metadata, static, target)
+            (target / GRAPH).write_bytes(model.SerializeToString())
+
+        made = build_once(factory, f"trace-{key.hexdigest()[:16]}", build)
+        shutil.copy(made / WEIGHTS, folder)
+        return onnx.load(made / GRAPH, load_external_data=False)
+
+    return kept
