@@ -23,6 +23,7 @@ def convert(
     .ply, .compressed.ply, .splat, .spz, .sog and .glb are read and written; .points.ply, .points.glb, .obj and .xyz are
     written as points. What a format cannot hold is named.
     """
+    from ..splats.filtering import describe_removed
     from ..splats.io import read_offset, read_splats, splat_suffix, write_splats
 
     splat_suffix(out)
@@ -35,7 +36,7 @@ def convert(
         whole, gaussians = len(gaussians), gaussians.select(gaussians.opacities >= min_opacity)
         if not len(gaussians):
             raise InputError(f"--min-opacity {min_opacity:g}: no Gaussian is left of {whole}; use a smaller one")
-        say(f"cleaned: {whole - len(gaussians):,} too faint; {len(gaussians):,} Gaussians left")
+        say(describe_removed({"min_opacity": whole - len(gaussians)}, len(gaussians)))
     for note in write_splats(out, gaussians, read_offset(scene)):
         say(f"note: {note}")
     say(f"wrote {out}: {len(gaussians):,} Gaussians, {out.stat().st_size / 1e6:.1f} MB")

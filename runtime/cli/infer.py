@@ -142,7 +142,7 @@ def infer(
     from ..inference.inputs import Request, read_inputs
     from ..inference.predictor import Predictor
     from ..splats.filtering import FilterOptions
-    from ..splats.io import holds_splats, is_surface
+    from ..splats.io import holds_splats, is_mesh
     from ..system.progress import working
 
     started = time.perf_counter()
@@ -172,7 +172,7 @@ def infer(
     prediction = _predict(prepared, predictor, span)
     writing = time.perf_counter()
     cleaned: dict[str, int] = {}
-    if cleaning.enabled and not is_surface(out):
+    if cleaning.enabled and not is_mesh(out):
         prediction, cleaned = _clean(prediction, prepared, cleaning)
     _write_scene(prediction, prepared, out, cleaning)
     pictures = _write_pictures(prediction, prepared, save_depth, depth_format, render)
@@ -338,19 +338,19 @@ def _check_fit(predictor: "Predictor", out: Path, cleaning: "FilterOptions", dra
 
     Of a model that predicts depth alone, a name that may stand for splats or points stands for points.
     """
-    from ..splats.io import MESHES, holds_splats, is_surface, splat_suffix
+    from ..splats.io import MESH_ENDINGS, holds_splats, is_mesh, splat_suffix
     from ..splats.points import POINT_SUFFIXES
 
     splats = holds_splats(out) and splat_suffix(out) not in POINT_SUFFIXES
     needs = [f"--out {out}"] * splats + [option for option, path in drawn.items() if path is not None]
-    if not is_surface(out):
+    if not is_mesh(out):
         needs += [f"--{step.replace('_', '-')}" for step in cleaning.enabled]
     if needs and not predictor.metadata.gaussians:
-        endings = ", ".join((*POINT_SUFFIXES, *MESHES))
+        endings = ", ".join((*POINT_SUFFIXES, *MESH_ENDINGS))
         raise InputError(
             f"{needs[0]}: {predictor.model.path} predicts depth alone; write points or a surface ({endings})"
         )
-    if is_surface(out) and set(cleaning.enabled) - {"max_depth_jump"}:
+    if is_mesh(out) and set(cleaning.enabled) - {"max_depth_jump"}:
         raise InputError(f"--out {out}: of all cleaning a surface knows --max-depth-jump alone; leave out the rest")
 
 
@@ -403,19 +403,19 @@ def _clean(
 
 def _write_scene(prediction: "Prediction", views: "ViewBatch", out: Path, cleaning: "FilterOptions") -> None:
     """Write the splats, points or surface that the file's name asks for."""
-    from ..splats.io import is_surface, lost_offset, write_splats
-    from ..splats.mesh import LARGEST_JUMP, faces_from_depth
+    from ..splats.io import is_mesh, lost_offset, write_splats
+    from ..splats.mesh import MAX_DEPTH_JUMP, faces_from_depth
     from ..splats.points import points_from_depth, write_mesh, write_point_cloud
 
-    if not is_surface(out) and prediction.gaussians is not None:
+    if not is_mesh(out) and prediction.gaussians is not None:
         for note in write_splats(out, prediction.gaussians, views.offset):
             say(f"note: {note}")
         return
     for note in lost_offset(views.offset):
         say(f"note: {note}")
     points = points_from_depth(prediction.depth, views.images, views.extrinsics, views.intrinsics)
-    if is_surface(out):
-        write_mesh(out, points, faces_from_depth(prediction.depth, cleaning.max_depth_jump or LARGEST_JUMP))
+    if is_mesh(out):
+        write_mesh(out, points, faces_from_depth(prediction.depth, cleaning.max_depth_jump or MAX_DEPTH_JUMP))
     else:
         write_point_cloud(out, points)
 

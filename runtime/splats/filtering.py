@@ -1,7 +1,7 @@
-"""Leaving out what spoils a scene: faint, marginal, torn, doubted and doubled Gaussians. Off unless asked for.
+"""Optional filters: opacity threshold, border crop, depth discontinuities, multi-view consistency, duplicate merging.
 
-A prediction has one Gaussian for each pixel of each view, so that what is wrong with one can be read off its picture,
-its depth map and the other views. Each step counts what it takes of what the steps before it left.
+A prediction has one Gaussian for each pixel of each view, so the filters can use the depth maps and the other views.
+They run in the order of the fields of `FilterOptions`, each on what the ones before it kept.
 """
 
 from dataclasses import dataclass, fields
@@ -11,20 +11,22 @@ import numpy as np
 from ..errors import InputError
 from ..geometry.consistency import depth_jumps, multi_view_consistency
 from .gaussians import Gaussians
-from .merging import duplicates, merged
+from .merging import find_duplicates, merge_gaussians
 
 
 @dataclass(frozen=True)
 class FilterOptions:
-    """What to leave out; nothing by default.
+    """Which Gaussians to remove; none by default.
 
-    min_opacity: Gaussians less opaque than this, 0 to 1.
-    crop_border: this many pixels along the edges of every image, where networks see the least.
-    max_depth_jump: pixels whose depth differs from a neighbour's by more than this share of it: at the edges of
-        objects, where depth maps put points between foreground and background. 0 for none.
-    min_consistency: pixels of which a smaller share of the other views than this, 0 to 1, confirms the depth; see
-        `consistency.confidence`.
-    merge_duplicates: make one Gaussian of those that different views put at the same place of the same surface.
+    min_opacity: those with a lower opacity, 0 to 1.
+    crop_border: those of so many pixels along the edges of every image, where networks have the least context.
+    max_depth_jump: those of pixels whose depth differs from a neighbour's by more than this fraction of it: at object
+        boundaries, where depth maps put points between foreground and background. 0 for no limit.
+    min_consistency: those of pixels whose depth is confirmed by a smaller fraction of the other views, 0 to 1; see
+        `geometry.consistency.multi_view_consistency`.
+    merge_duplicates: merge Gaussians that different views predict at the same point of a surface into one.
+
+    Raises InputError if a value is out of range.
     """
 
     min_opacity: float = 0.0
@@ -40,64 +42,67 @@ class FilterOptions:
         if self.crop_border < 0:
             raise InputError(f"--crop-border {self.crop_border}: expected a number of pixels, 0 or more")
         if not 0 <= self.max_depth_jump < np.inf:
-            raise InputError(f"--max-depth-jump {self.max_depth_jump:g}: expected a share of the depth, such as 0.05")
+            raise InputError(
+                f"--max-depth-jump {self.max_depth_jump:g}: expected a fraction of the depth, such as 0.05"
+            )
 
     @property
     def enabled(self) -> list[str]:
-        """Names of the steps to take, in order."""
+        """Names of the filters that are on, in the order in which they run."""
         return [field.name for field in fields(self) if getattr(self, field.name)]
 
 
 def filter_gaussians(
-    gaussians: Gaussians, depth: np.ndarray, extrinsics: np.ndarray, intrinsics: np.ndarray, cleaning: FilterOptions
+    gaussians: Gaussians, depth: np.ndarray, extrinsics: np.ndarray, intrinsics: np.ndarray, options: FilterOptions
 ) -> tuple[Gaussians, dict[str, int]]:
-    """What is left of the Gaussians, and how many each step took, by the names of the steps asked for.
+    """The Gaussians that the filters keep, and how many each filter removed, by its name.
 
     gaussians: one for each pixel, ordered by view, row, column. depth: z-depth, [views, height, width]. extrinsics:
     camera-to-world, OpenCV axes, [views, 4, 4]. intrinsics: normalised by width and height, [views, 3, 3].
-    Raises InputError if a step does not fit the pictures, or nothing is left.
+    Raises InputError if a border is wider than the images, or no Gaussian is left.
     """
     means = gaussians.means.reshape(*depth.shape, 3)
-    kept, taken = np.ones(depth.shape, bool), {}
-    for step in cleaning.enabled:
+    kept, removed = np.ones(depth.shape, bool), {}
+    for name in options.enabled:
         before = int(kept.sum())
-        match step:
+        match name:
             case "min_opacity":
-                kept &= gaussians.opacities.reshape(depth.shape) >= cleaning.min_opacity
+                kept &= gaussians.opacities.reshape(depth.shape) >= options.min_opacity
             case "crop_border":
-                kept &= _inner(depth.shape[1:], cleaning.crop_border)
+                kept &= _inner(depth.shape[1:], options.crop_border)
             case "max_depth_jump":
-                kept &= depth_jumps(depth) <= cleaning.max_depth_jump
+                kept &= depth_jumps(depth) <= options.max_depth_jump
             case "min_consistency":
-                kept &= multi_view_consistency(means, depth, extrinsics, intrinsics) >= cleaning.min_consistency
+                kept &= multi_view_consistency(means, depth, extrinsics, intrinsics) >= options.min_consistency
             case "merge_duplicates":
-                same_as = duplicates(means, depth, kept, extrinsics, intrinsics)
-                gaussians = merged(gaussians, same_as)
-                kept &= same_as == np.arange(kept.size).reshape(kept.shape)
-        taken[step] = before - int(kept.sum())
+                representative = find_duplicates(means, depth, kept, extrinsics, intrinsics)
+                gaussians = merge_gaussians(gaussians, representative)
+                kept &= representative == np.arange(kept.size).reshape(kept.shape)
+        removed[name] = before - int(kept.sum())
     if not kept.any():
-        raise InputError(f"{', '.join(map(_option, taken))}: no Gaussian is left of {kept.size}; ask for less cleaning")
-    return gaussians.select(kept.ravel()), taken
+        raise InputError(f"{', '.join(map(_option, removed))}: no Gaussian is left of {kept.size}; filter less")
+    return gaussians.select(kept.ravel()), removed
 
 
-def describe_removed(taken: dict[str, int], left: int) -> str:
-    """The counts of `filter_gaussians` in a line."""
+def describe_removed(removed: dict[str, int], left: int) -> str:
+    """The counts of `filter_gaussians` in one line."""
     words = {
-        "min_opacity": "too faint",
-        "crop_border": "at borders",
-        "max_depth_jump": "at depth edges",
+        "min_opacity": "below the opacity threshold",
+        "crop_border": "at image borders",
+        "max_depth_jump": "at depth discontinuities",
         "min_consistency": "not confirmed by other views",
         "merge_duplicates": "merged into another view's",
     }
-    return f"cleaned: {', '.join(f'{taken[step]:,} {words[step]}' for step in taken)}; {left:,} Gaussians left"
+    counts = ", ".join(f"{count:,} {words[name]}" for name, count in removed.items())
+    return f"filtered: {counts}; {left:,} Gaussians left"
 
 
-def _option(step: str) -> str:
-    return "--" + step.replace("_", "-")
+def _option(name: str) -> str:
+    return "--" + name.replace("_", "-")
 
 
 def _inner(shape: tuple[int, ...], border: int) -> np.ndarray:
-    """A mask [height, width] of the pixels that are not at the border."""
+    """A mask [height, width] of the pixels inside a border."""
     if 2 * border >= min(shape):
         raise InputError(f"--crop-border {border}: nothing is left of {shape[0]}x{shape[1]} pixels; use a smaller one")
     inner = np.zeros(shape, bool)

@@ -1,4 +1,4 @@
-"""The Gaussians: what the model predicts, the files hold and the rasteriser draws."""
+"""The set of 3D Gaussians that models predict, files hold and the rasteriser renders."""
 
 from dataclasses import dataclass, fields
 from math import isqrt
@@ -9,18 +9,21 @@ import numpy as np
 from ..errors import InputError, raise_input_error
 from ..geometry.sh import SH_0
 
-FLOAT32_BYTES, WITHOUT_SH = 4, 11  # numbers of a Gaussian beside its spherical harmonics
+FLOAT32_BYTES = 4
+VALUES_WITHOUT_SH = 11  # of a Gaussian: 3 means, 3 scales, 4 quats, 1 opacity
 
 
 @dataclass(frozen=True)
 class Gaussians:
-    """A set of 3D Gaussians in the world frame, in gsplat's terms, all float32.
+    """A set of 3D Gaussians in the world frame, with gsplat's names and units, all float32.
 
-    means: centres in world units, [gaussians, 3].
-    scales: standard deviations along the three axes in world units (not their logarithm), [gaussians, 3].
-    quats: rotations of the axes to the world, wxyz, [gaussians, 4].
+    means: world units, [gaussians, 3].
+    scales: standard deviations along the Gaussian's own axes in world units (not logarithms), [gaussians, 3].
+    quats: rotations from the Gaussian's axes to the world, wxyz, [gaussians, 4].
     opacities: in [0, 1] (not logits), [gaussians].
-    sh: spherical harmonics in the basis of 3DGS, [gaussians, (degree + 1)^2, 3].
+    sh: SH coefficients in the basis of 3DGS (`geometry.sh`), [gaussians, (degree + 1)^2, 3].
+
+    Raises InputError if the shapes do not agree.
     """
 
     means: np.ndarray
@@ -44,27 +47,27 @@ class Gaussians:
         return len(self.means)
 
     def select(self, index: np.ndarray) -> "Gaussians":
-        """Some of the Gaussians: those that a mask keeps, or these, in this order."""
+        """The Gaussians at a mask or at indices, in their order."""
         return Gaussians(*(getattr(self, field.name)[index] for field in fields(self)))
 
     @property
     def sh_degree(self) -> int:
-        """Degree of the spherical harmonics, 0 to 3."""
+        """SH degree, 0 to 3."""
         return isqrt(self.sh.shape[1]) - 1
 
     @property
     def colours(self) -> np.ndarray:
-        """Red, green and blue without the part that changes with the direction, usually in [0, 1], [gaussians, 3]."""
+        """RGB of SH degree 0, 0.5 + SH_0 sh_0, usually in [0, 1], [gaussians, 3]."""
         return 0.5 + np.float32(SH_0) * self.sh[:, 0]
 
 
 def bytes_in_memory(count: int, sh_degree: int) -> int:
-    """What so many Gaussians of this degree take."""
-    return count * FLOAT32_BYTES * (WITHOUT_SH + 3 * (sh_degree + 1) ** 2)
+    """Size of `count` Gaussians of an SH degree."""
+    return count * FLOAT32_BYTES * (VALUES_WITHOUT_SH + 3 * (sh_degree + 1) ** 2)
 
 
 def check_ranges(path: Path, gaussians: Gaussians) -> None:
-    """Raise InputError for values in a file's units instead of ours, before they are written to it."""
+    """Raise InputError, before a file is written, for log scales or opacity logits where `Gaussians` has neither."""
     if (gaussians.scales < 0).any():
         raise InputError(f"cannot write {path}: scales holds negative values; pass standard deviations, not logarithms")
     if ((gaussians.opacities < 0) | (gaussians.opacities > 1)).any():
@@ -72,7 +75,7 @@ def check_ranges(path: Path, gaussians: Gaussians) -> None:
 
 
 def check_finite(path: Path, gaussians: Gaussians) -> None:
-    """Raise InputError for the first value, on its way to or from a file, that is not finite."""
+    """Raise InputError for the first value, read from or to be written to a file, that is not finite."""
     for field in fields(gaussians):
         finite = np.isfinite(getattr(gaussians, field.name))
         if not finite.all():
@@ -83,6 +86,6 @@ def check_finite(path: Path, gaussians: Gaussians) -> None:
 def with_colours(
     means: np.ndarray, scales: np.ndarray, quats: np.ndarray, opacities: np.ndarray, colours: np.ndarray
 ) -> Gaussians:
-    """Gaussians of the same colour [gaussians, 3] from all sides, as float32 arrays."""
+    """Gaussians of SH degree 0 with these colours, RGB [gaussians, 3], as contiguous float32 arrays."""
     sh = (colours[:, None] - 0.5) / SH_0
     return Gaussians(*(np.ascontiguousarray(array, np.float32) for array in (means, scales, quats, opacities, sh)))

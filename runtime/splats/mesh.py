@@ -1,15 +1,15 @@
-"""Depth maps as surfaces: neighbouring pixels joined by triangles, except where the depth jumps."""
+"""Meshes from depth maps: triangles between neighbouring pixels, cut at depth discontinuities."""
 
 import numpy as np
 
-LARGEST_JUMP = 0.05  # share of the depth by which the corners of a triangle may differ
+MAX_DEPTH_JUMP = 0.05  # fraction of the nearest corner's depth by which the corners of a triangle may differ
 
 
-def faces_from_depth(depth: np.ndarray, largest_jump: float = LARGEST_JUMP) -> np.ndarray:
-    """Triangles between the pixels of each view, as indices into all pixels ordered by view, row, column, [faces, 3].
+def faces_from_depth(depth: np.ndarray, max_depth_jump: float = MAX_DEPTH_JUMP) -> np.ndarray:
+    """Triangles between the pixels of each view, indices into all pixels in the order view, row, column, [faces, 3].
 
-    depth: z-depth, [views, height, width]. They face the camera, and none joins pixels whose depths differ by more than
-    `largest_jump` of the nearer one: there, one thing stands before another.
+    depth: z-depth, [views, height, width]. The triangles face the camera. Those whose depths differ by more than
+    `max_depth_jump` of the smallest are left out: they would connect foreground and background.
     """
     pixels = np.arange(depth.size).reshape(depth.shape)
     corners = [pixels[:, :-1, :-1], pixels[:, 1:, :-1], pixels[:, :-1, 1:], pixels[:, 1:, 1:]]
@@ -18,4 +18,4 @@ def faces_from_depth(depth: np.ndarray, largest_jump: float = LARGEST_JUMP) -> n
     lower = np.stack([top_right, bottom_left, bottom_right], axis=1)
     faces = np.concatenate([upper, lower])
     distances = depth.ravel()[faces]
-    return faces[distances.max(axis=1) <= (1 + largest_jump) * distances.min(axis=1)]
+    return faces[distances.max(axis=1) <= (1 + max_depth_jump) * distances.min(axis=1)]

@@ -1,7 +1,7 @@
-"""Coloured points and surfaces: a point for each pixel, where its depth puts it, or for each Gaussian.
+"""Coloured point clouds and meshes from depth maps or Gaussians, and their files.
 
-Written by trimesh as .ply, .obj and .glb, in the frame that they have, except for .glb: glTF's axes are x left, y up,
-z forward, so that is turned by half around z, and its colours are linear. `.xyz` is a line of x y z r g b for each.
+trimesh writes .ply, .obj and .glb. Coordinates are those of the cameras, but in .glb they have glTF's axes (x left, y
+up, z forward) and colours are linear. `.xyz` has a line x y z r g b for each point.
 """
 
 from dataclasses import dataclass
@@ -15,14 +15,14 @@ from ..system.files import atomic_write
 from .axes import GLTF
 from .gaussians import Gaussians
 
-# What `write_point_cloud` and `write_mesh` know to write.
+# Formats of `write_point_cloud` and `write_mesh`.
 POINT_SUFFIXES = (".ply", ".glb", ".obj", ".xyz")
 MESH_SUFFIXES = (".ply", ".glb", ".obj")
 
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Points with colours.
+    """Coloured points.
 
     positions: world units and axes of the cameras given, float32 [points, 3].
     colours: RGB, uint8 [points, 3].
@@ -38,7 +38,7 @@ class PointCloud:
 def points_from_depth(
     depth: np.ndarray, images: np.ndarray, extrinsics: np.ndarray, intrinsics: np.ndarray
 ) -> PointCloud:
-    """Every pixel's centre at its depth, in its colour, ordered by view, row, column.
+    """A point for each pixel in the order view, row, column: its centre at its depth, in its colour.
 
     depth: z-depth in world units, [views, height, width]. images: RGB in [0, 1], [views, 3, height, width].
     extrinsics: camera-to-world, OpenCV axes, [views, 4, 4]. intrinsics: normalised by width and height, [views, 3, 3].
@@ -49,7 +49,7 @@ def points_from_depth(
 
 
 def unproject(depth: np.ndarray, extrinsics: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    """Where every pixel's centre lies in the world, [views, height, width, 3] float64; arguments as above."""
+    """World coordinates of every pixel's centre, float64 [views, height, width, 3]; arguments as above."""
     views, height, width = depth.shape
     x, y = (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
     pixels = np.stack([*np.meshgrid(x, y), np.ones((height, width))], axis=-1).reshape(-1, 3)
@@ -59,36 +59,36 @@ def unproject(depth: np.ndarray, extrinsics: np.ndarray, intrinsics: np.ndarray)
 
 
 def points_from_gaussians(gaussians: Gaussians) -> PointCloud:
-    """The centre of every Gaussian, in the colour that it has from all sides."""
+    """The mean of every Gaussian, in the colour of SH degree 0."""
     return PointCloud(gaussians.means, to_uint8(gaussians.colours))
 
 
 def write_point_cloud(path: Path, cloud: PointCloud) -> None:
-    """Write points in the form of the path's suffix; raises InputError if the file cannot be written."""
+    """Write points in the format of the path's suffix; raises InputError if the file cannot be written."""
     import trimesh
 
     with atomic_write(path) as temporary:
         if path.suffix.lower() == ".xyz":
             np.savetxt(temporary, np.column_stack([cloud.positions, cloud.colours]), "%.9g %.9g %.9g %d %d %d")
         else:
-            positions, colours = _in_form(path, cloud)
+            positions, colours = _converted(path, cloud)
             _export(trimesh.PointCloud(positions, colors=colours), temporary)
 
 
 def write_mesh(path: Path, cloud: PointCloud, faces: np.ndarray) -> None:
-    """Write a surface, its corners coloured, in the form of the path's suffix; raises InputError as above.
+    """Write a mesh with vertex colours in the format of the path's suffix; raises InputError as above.
 
-    faces: three indices of points each, anticlockwise as seen from the front, [faces, 3].
+    faces: indices of three points each, counterclockwise seen from the front, [faces, 3].
     """
     import trimesh
 
-    positions, colours = _in_form(path, cloud)
+    positions, colours = _converted(path, cloud)
     with atomic_write(path) as temporary:
         _export(trimesh.Trimesh(positions, faces, vertex_colors=colours, process=False), temporary)
 
 
-def _in_form(path: Path, cloud: PointCloud) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and colours as the path's format wants them."""
+def _converted(path: Path, cloud: PointCloud) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and colours in the conventions of the path's format."""
     if path.suffix.lower() != ".glb":
         return cloud.positions, cloud.colours
     return cloud.positions * np.array(GLTF, np.float32), to_uint8(srgb_to_linear(cloud.colours / 255))

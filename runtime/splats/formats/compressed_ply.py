@@ -21,9 +21,9 @@ from ...geometry.quaternions import from_smallest_three, normalize_quaternions, 
 from ...geometry.sh import SH_0
 from ...system.files import atomic_write, read_bytes
 from ..gaussians import Gaussians, check_finite, check_ranges
+from .encoding import clipped_note
 from .morton import morton_order
 from .ply_header import LIST, Element, offset_comment, read_header
-from .quantization import clipped_note
 
 CHUNK = 256  # Gaussians
 RANGES = (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))  # of a chunk

@@ -23,7 +23,7 @@ MIN_OPACITY = 1e-6  # a logit must be finite: opacities are kept this far from 0
 MIN_SCALE = 1e-30  # so must a logarithm
 
 
-def write_ply(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None) -> None:
+def write_ply(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None) -> list[str]:
     """Write Gaussians, every SH band, as a binary .ply; the file appears whole or not at all.
 
     offset: what was subtracted from the world coordinates, [3], which a comment records.
@@ -51,6 +51,7 @@ def write_ply(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None
                     "leave that Gaussian out"
                 )
             file.write(rows.data)
+    return []
 
 
 def read_ply(path: Path) -> Gaussians:

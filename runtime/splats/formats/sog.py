@@ -26,9 +26,9 @@ from ...geometry.quaternions import from_smallest_three, normalize_quaternions, 
 from ...system.files import atomic_write, check_expansion, read_bytes
 from ..gaussians import Gaussians, bytes_in_memory, check_finite, check_ranges
 from .codebooks import ENTRIES, build_codebook, cluster_vectors, quantize
+from .encoding import round_to_uint8
 from .morton import morton_order
 from .ply_header import OFFSET, checked_offset
-from .quantization import round_to_uint8
 
 VERSION = 2
 META = "meta.json"

@@ -13,13 +13,13 @@ from ...errors import raise_input_error
 from ...geometry.quaternions import normalize_quaternions
 from ...system.files import atomic_write, read_bytes
 from ..gaussians import Gaussians, check_finite, check_ranges, with_colours
-from .quantization import clipped_note, round_to_uint8
+from .encoding import clipped_note, lost_offset, round_to_uint8
 
 RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 ZERO, ONE = 128, 128  # of the rotation's bytes
 
 
-def write_splat(path: Path, gaussians: Gaussians) -> list[str]:
+def write_splat(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None) -> list[str]:
     """Write Gaussians as a .splat; the file appears whole or not at all.
 
     Returns a line for each thing that the format cannot hold. Raises InputError if a value is not finite or not in our
@@ -36,7 +36,7 @@ def write_splat(path: Path, gaussians: Gaussians) -> list[str]:
     with atomic_write(path) as temporary:
         temporary.write_bytes(records.tobytes())
     lost = ["spherical harmonics above degree 0 left out"] if gaussians.sh_degree else []
-    return lost + clipped_note("colours", gaussians.colours, 0, 1)
+    return lost + clipped_note("colours", gaussians.colours, 0, 1) + lost_offset(offset)
 
 
 def read_splat(path: Path) -> Gaussians:

@@ -22,7 +22,7 @@ from ...geometry.sh import SH_0
 from ...system.files import atomic_write, read_bytes
 from ..axes import OPENGL, convert_axes
 from ..gaussians import Gaussians, check_finite, check_ranges
-from .quantization import clipped_note, round_to_uint8
+from .encoding import clipped_note, lost_offset, round_to_uint8
 from .spz_container import EXPECTED, HEADER, MAGIC, MOST_FRACTIONAL_BITS, unpack
 
 VERSION = 3  # to write: version 4 is not read everywhere yet
@@ -35,7 +35,7 @@ SH_HIGHEST = 127.5 / 128  # rounded, the highest byte
 QUAT_STEPS = 511 / np.sqrt(0.5)  # magnitude of a smallest part in 9 bits; the tenth is its sign
 
 
-def write_spz(path: Path, gaussians: Gaussians) -> list[str]:
+def write_spz(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None) -> list[str]:
     """Write Gaussians as a .spz; the file appears whole or not at all.
 
     Returns a line for each thing that the format cannot hold. Raises InputError if a value is not finite or not in our
@@ -65,7 +65,7 @@ def write_spz(path: Path, gaussians: Gaussians) -> list[str]:
     highest = np.exp(255 / LOG_SCALE_STEPS - LOG_SCALE_OFFSET)
     notes = clipped_note("scales", turned.scales, np.exp(-LOG_SCALE_OFFSET), highest)
     notes += clipped_note("spherical harmonics", rest, -1, SH_HIGHEST)
-    return notes + clipped_note("colours", gaussians.colours, *_colour_range())
+    return notes + clipped_note("colours", gaussians.colours, *_colour_range()) + lost_offset(offset)
 
 
 def read_spz(path: Path) -> Gaussians:

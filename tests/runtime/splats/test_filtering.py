@@ -14,7 +14,7 @@ from idesplat.runtime.images.io import load_image
 from idesplat.runtime.rendering.render import render_view
 from idesplat.runtime.splats.filtering import FilterOptions, describe_removed, filter_gaussians
 from idesplat.runtime.splats.gaussians import Gaussians
-from idesplat.runtime.splats.merging import merged
+from idesplat.runtime.splats.merging import merge_gaussians
 from idesplat.runtime.splats.points import points_from_depth
 
 HEIGHT, WIDTH = 12, 16
@@ -170,7 +170,7 @@ def test_merging_keeps_the_moments() -> None:
         opacities=np.float32([0.2, 0.9, 0.5, 1.0, 0.3]),
         sh=rng.normal(size=(5, 4, 3)).astype(np.float32),
     )
-    result = merged(gaussians, np.array([0, 0, 2, 3, 0]))
+    result = merge_gaussians(gaussians, np.array([0, 0, 2, 3, 0]))
     members = [0, 1, 4]
     weight = gaussians.opacities[members] / gaussians.opacities[members].sum()
     mean = weight @ gaussians.means[members]
@@ -197,7 +197,7 @@ def test_quaternions_and_matrices() -> None:
 
 def test_the_line_names_and_counts() -> None:
     line = describe_removed({"min_opacity": 1234, "merge_duplicates": 5}, 100_000)
-    assert line == "cleaned: 1,234 too faint, 5 merged into another view's; 100,000 Gaussians left"
+    assert line == "filtered: 1,234 below the opacity threshold, 5 merged into another view's; 100,000 Gaussians left"
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from idesplat.runtime.rendering.rasterizer import rasterize
 from idesplat.runtime.splats.axes import GLTF
 from idesplat.runtime.splats.formats.ply import read_ply, write_ply
 from idesplat.runtime.splats.gaussians import Gaussians
-from idesplat.runtime.splats.io import FORMATS, MESHES, POINTS, read_splats, splat_suffix, write_splats
+from idesplat.runtime.splats.io import FORMATS, MESH_ENDINGS, POINT_ENDINGS, read_splats, splat_suffix, write_splats
 from plyfile import PlyData
 from splat_cases import (
     ARRAYS,
@@ -250,23 +250,21 @@ def test_the_longest_ending_counts() -> None:
         splat_suffix(Path("scene.txt"))
 
 
-@pytest.mark.parametrize("suffix", POINTS)
+@pytest.mark.parametrize("suffix", POINT_ENDINGS)
 def test_points_of_a_scene(tmp_path: Path, truth: Gaussians, suffix: str) -> None:
     path = tmp_path / f"scene{suffix}"
-    assert write_splats(path, truth) == [
-        "points alone, without size, opacity or anything that changes with the direction"
-    ]
+    assert write_splats(path, truth) == ["points only: no scales, rotations, opacities or view-dependent colour"]
     positions = (
         np.loadtxt(path)[:, :3] if suffix == ".xyz" else trimesh.load(path, force="scene").to_geometry().vertices
     )
     signs = GLTF if suffix.endswith(".glb") else (1, 1, 1)
     np.testing.assert_allclose(positions, truth.means * signs, rtol=1e-6, atol=1e-8)
-    with pytest.raises(InputError, match="points and surfaces hold no Gaussians"):
+    with pytest.raises(InputError, match="points and meshes hold no Gaussians"):
         read_splats(path)
 
 
 def test_a_surface_is_not_made_of_gaussians(tmp_path: Path, truth: Gaussians) -> None:
-    for suffix in MESHES:
+    for suffix in MESH_ENDINGS:
         with pytest.raises(InputError, match="write it with idesplat-infer"):
             write_splats(tmp_path / f"scene{suffix}", truth)
 
@@ -300,7 +298,9 @@ def test_the_command_leaves_out_what_is_faint(
     write_ply(Path("a.ply"), truth)
     kept = truth.opacities >= 0.3
     assert run_command(convert, "a.ply", "b.glb", "--min-opacity", "0.3") == 0
-    assert f"cleaned: {(~kept).sum()} too faint; {kept.sum()} Gaussians left" in capsys.readouterr().out
+    assert (
+        f"filtered: {(~kept).sum()} below the opacity threshold; {kept.sum()} Gaussians left" in capsys.readouterr().out
+    )
     np.testing.assert_array_equal(read_splats(Path("b.glb")).means, truth.means[kept])
     for value, message in (("1", "--min-opacity 1: no Gaussian is left of 270"), ("nan", "--min-opacity nan")):
         assert run_command(convert, "a.ply", "c.glb", "--min-opacity", value) == 2

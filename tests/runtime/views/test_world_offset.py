@@ -150,7 +150,7 @@ def test_conversion_keeps_the_offset(tmp_path: Path, capsys: pytest.CaptureFixtu
         assert run_command(convert_main, path, converted) == 0
         np.testing.assert_array_equal(read_offset(converted), PLACE)
     assert run_command(convert_main, path, tmp_path / "converted.splat") == 0
-    assert "does not hold that its coordinates are relative to 433125.25" in capsys.readouterr().out
+    assert "does not record that its coordinates are relative to 433125.25" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("line", ("nan 0 0", "a b c", "1e999 0 0"))
