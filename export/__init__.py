@@ -1,3 +1,3 @@
-"""From a checkpoint to ONNX graphs that any runtime can load, checked against PyTorch before they are handed out."""
+"""Export: from a checkpoint to ONNX graphs, verified against PyTorch before they are written."""
 
 from ..runtime import startup as startup

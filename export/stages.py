@@ -7,7 +7,6 @@ them a later stage reads is not written down anywhere: it is read off the traced
 from dataclasses import dataclass
 
 import onnx
-import torch
 from torch import Tensor, nn
 
 from ..model.common.network import Network
@@ -67,21 +66,3 @@ def stage_graph(traced: onnx.ModelProto, stage: Stage) -> onnx.ModelProto:
     weights = [weight for weight in traced.graph.initializer if weight.name in read]
     graph = onnx.helper.make_graph(nodes, stage.name, inputs, outputs, weights)
     return onnx.helper.make_model(graph, opset_imports=traced.opset_import)
-
-
-def example_inputs(views: int, height: int, width: int, near: float, far: float) -> dict[str, Tensor]:
-    """Cameras on an arc before a textured scene, and pictures of noise at several scales: every part has work to do."""
-    generator = torch.Generator().manual_seed(views)
-    images = torch.zeros(views, 3, height, width)
-    for size in (2, 4, 8, 16):
-        noise = torch.rand(views, 3, height // size + 1, width // size + 1, generator=generator)
-        images += nn.functional.interpolate(noise, (height, width), mode="bilinear", align_corners=True) / 4
-    angle = torch.linspace(-0.1, 0.1, views)
-    extrinsics = torch.eye(4).repeat(views, 1, 1)
-    extrinsics[:, 0, 0] = extrinsics[:, 2, 2] = angle.cos()
-    extrinsics[:, 0, 2], extrinsics[:, 2, 0] = -angle.sin(), angle.sin()
-    extrinsics[:, 0, 3] = near * torch.linspace(-0.4, 0.4, views)
-    extrinsics[:, 1, 3] = near * 0.1 * torch.rand(views, generator=generator)
-    intrinsics = torch.tensor([[0.9, 0.0, 0.52], [0.0, 0.9, 0.47], [0.0, 0.0, 1.0]]).repeat(views, 1, 1)
-    values = (images, extrinsics, intrinsics, torch.full((views,), near), torch.full((views,), far))
-    return dict(zip(INPUTS, values, strict=True))

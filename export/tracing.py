@@ -11,13 +11,13 @@ import onnx
 import torch
 
 from ..runtime.inference.metadata import INPUTS, METADATA_KEY, OUTPUTS, ModelMetadata
+from .example_inputs import example_inputs, room_inputs
 from .graph.cleanup import simplify
 from .graph.external_data import fill_inputs
 from .graph.gather_loops import chunked, lower_custom_ops
 from .precision.convert import convert_precision
 from .precision.int8 import Feeds
-from .room import room_inputs
-from .stages import NamedTensors, Stage, example_inputs, find_stages, stage_graph
+from .stages import NamedTensors, Stage, find_stages, stage_graph
 
 OPSET = 20
 IR_VERSION = 10

@@ -25,7 +25,10 @@ ORDERS = {
         *("rendering", "viewer", "cli"),
     ),
     "model": ("config", "common", "family", "idesplat", "depthsplat", "registry", "checkpoint"),
-    "export": ("existing_exports", "graph", "stages", "room", "precision", "tracing", "validation", "pipeline", "cli"),
+    "export": (
+        *("existing_exports", "graph", "stages", "example_inputs", "precision", "tracing", "validation"),
+        *("conversion", "pipeline", "cli"),
+    ),
     "tools": ("processes", "synthetic", "training", "evaluation", "benchmark", "figures"),
 }
 

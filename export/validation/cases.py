@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 
 from ...runtime.inference.metadata import ModelMetadata
-from ..room import room_inputs, with_room
-from ..stages import NamedTensors, example_inputs
+from ..example_inputs import example_inputs, room_inputs, with_room
+from ..stages import NamedTensors
 from ..tracing import StaticShape
 
 # Where views are not fixed; more than `ORDERED_VIEWS` of model/common/geometry.py, and more than a view has neighbours.
-MOST_VIEWS_OF_A_CASE = 5
+MAX_CASE_VIEWS = 5
 # By how much the views' focal lengths, principal points and depth ranges differ.
 FOCAL_SPREAD, CENTRE_SPREAD, NEAR_SPREAD = 0.15, 0.04, 0.3
 NEARER = 0.8  # a near end over the trained one
@@ -42,7 +42,7 @@ def verification_cases(network: NamedTensors, description: ModelMetadata, static
     across, upright = (static.size or (rows * block, columns * block) for rows, columns in ((6, 8), (8, 6)))
     room = room_inputs(static.views or 2, *trained, near, far)
     yield _case(network, "room", room)
-    noise = example_inputs(static.views or MOST_VIEWS_OF_A_CASE, *across, near, far)
+    noise = example_inputs(static.views or MAX_CASE_VIEWS, *across, near, far)
     yield _case(network, "noise", different_cameras(noise))
     nearer = NEARER * near
     cameras = different_cameras(example_inputs(static.views or 3, *upright, nearer, far))

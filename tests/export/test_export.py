@@ -10,8 +10,8 @@ import onnx
 import pytest
 import torch
 from conftest import SMALL_PRESET, run_command, small_network
-from idesplat.export import cli
-from idesplat.export.stages import example_inputs
+from idesplat.export import cli, pipeline
+from idesplat.export.example_inputs import example_inputs
 from idesplat.export.validation.compare import TensorError
 from idesplat.model.family import ErrorQuantiles
 from idesplat.runtime.inference.metadata import INPUTS, OUTPUTS, read_manifest, read_metadata
@@ -120,7 +120,7 @@ def test_a_departing_graph_leaves_no_file(small_checkpoint, presets, tmp_path, m
     mismatch = TensorError(
         "2 views", "encoder", "encoder.features_mv", ErrorQuantiles(1, 2, 3), ErrorQuantiles(1, 2, 2), 3.0
     )
-    monkeypatch.setattr("idesplat.export.validation.compare.verify", lambda *_: iter([mismatch]))
+    monkeypatch.setattr("idesplat.export.conversion.verify", lambda *_: iter([mismatch]))
     out, staged = tmp_path / "model.onnx", tmp_path / "staged"
     assert run_command(cli.main, small_checkpoint, out, "--staged", staged) == 1
     assert list(tmp_path.iterdir()) == []
@@ -203,7 +203,7 @@ def test_a_full_disk_is_named_and_leaves_nothing(small_checkpoint, presets, tmp_
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("idesplat.export.tracing.export_graphs", full)
+    monkeypatch.setattr("idesplat.export.conversion.export_graphs", full)
     assert run_command(cli.main, small_checkpoint, tmp_path / "out.onnx", "--staged", tmp_path / "staged") == 2
     message = capsys.readouterr().err.splitlines()[-1]
     assert message.startswith("error: ") and "No space left on device" in message
@@ -217,6 +217,6 @@ def test_metadata_of_another_layout_is_refused(tmp_path):
 
 
 def test_without_pytorch_the_remedy_is_named(small_checkpoint, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(cli, "find_spec", lambda name: None)
+    monkeypatch.setattr(pipeline, "find_spec", lambda name: None)
     assert run_command(cli.main, small_checkpoint, tmp_path / "out.onnx") == 2
     assert "pip install 'idesplat[export]'" in capsys.readouterr().err

@@ -13,8 +13,8 @@ import trimesh
 from conftest import run_command
 from depthsplat_cases import ONE_SCALE, SMALL
 from idesplat.export.cli import main as export
+from idesplat.export.example_inputs import example_inputs
 from idesplat.export.graph import external_data as weights
-from idesplat.export.stages import example_inputs
 from idesplat.model.registry import PRESETS, build
 from idesplat.runtime.cli.infer import main as infer
 from idesplat.runtime.inference.metadata import INPUTS, read_manifest

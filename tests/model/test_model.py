@@ -3,7 +3,7 @@
 import pytest
 import torch
 from conftest import SMALL, small_network
-from idesplat.export.stages import example_inputs
+from idesplat.export.example_inputs import example_inputs
 from idesplat.model.common import geometry
 from idesplat.model.common.gaussian_adapter import GaussianAdapter
 from idesplat.model.common.geometry import Cameras

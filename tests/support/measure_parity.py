@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from idesplat.export.cli import describe
+from idesplat.export.conversion import build_metadata
 from idesplat.export.precision.convert import PRECISIONS
 from idesplat.export.stages import NamedTensors
 from idesplat.export.tracing import StaticShape, export_graphs
@@ -71,7 +71,7 @@ def variants(
     for precision in PRECISIONS:
         (folder / precision).mkdir()
         graphs = export_graphs(
-            network, describe(model, "", "", "", StaticShape(), precision), StaticShape(), folder / precision
+            network, build_metadata(model, "", "", "", StaticShape(), precision), StaticShape(), folder / precision
         )
         exported = Exported([(stage, graphs.of_stage(stage)) for stage in graphs.stages], staged=False)
         rows = compare(exported, [between], network.family.tolerances[precision])

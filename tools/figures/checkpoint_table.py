@@ -9,7 +9,6 @@ since the features of neighbouring pixels then have nothing in common. Seconds a
 not change when others use the machine, too.
 """
 
-import contextlib
 import math
 import os
 import tempfile
@@ -23,7 +22,7 @@ import numpy as np
 import torch
 import typer
 
-from ...export.cli import export
+from ...export.pipeline import export_checkpoint
 from ...model.common.network import Network
 from ...model.registry import PRESETS, build, family_of
 from ...runtime.cli.terminal import run, say
@@ -162,15 +161,14 @@ def drawn(preset: str, checkpoint: Path, workload: Workload) -> Prepared:
 
 
 def exporting(checkpoint: Path, preset: str, model: Path) -> Prepared:
-    """The command idesplat-export, with what it prints left out; a run gives its processor seconds."""
+    """The export; a run gives its processor seconds."""
 
     # ONNX Runtime takes as many threads as there are cores to run on, and its idle ones would count as well.
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 
     def run() -> None:
-        with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
-            export(checkpoint, model, preset=preset)
+        export_checkpoint(checkpoint, model, preset=preset)
 
     return None, _timed(run)
 

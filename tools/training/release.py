@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from ...export.cli import export
+from ...export.pipeline import export_checkpoint
 from ...runtime.cli.terminal import run
 from ...runtime.errors import exit_on_input_error
 from ...runtime.inference.bundled_model import CHECKSUM_SUFFIX, FOLDER, NAME
@@ -27,7 +27,7 @@ def release_bundled_model(
 ) -> None:
     """Export a checkpoint as the bundled model."""
     path = make_folder(FOLDER) / NAME
-    export(checkpoint, path, preset=preset)
+    export_checkpoint(checkpoint, path, preset=preset)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     with atomic_write(path.with_name(NAME + CHECKSUM_SUFFIX)) as temporary:
         temporary.write_text(f"{digest}  {NAME}\n")

@@ -8,7 +8,7 @@ import pytest
 from conftest import run_command
 from idesplat import Predictor
 from idesplat.export import cli
-from idesplat.export.stages import example_inputs
+from idesplat.export.example_inputs import example_inputs
 from idesplat.runtime.inference.metadata import INPUTS, OUTPUTS
 from onnx import TensorProto
 

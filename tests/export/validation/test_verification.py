@@ -7,8 +7,8 @@ import onnx
 import pytest
 import torch
 from conftest import run_command, small_network
-from idesplat.export import cli
-from idesplat.export.room import room_inputs
+from idesplat.export import cli, conversion
+from idesplat.export.example_inputs import room_inputs
 from idesplat.export.stages import NamedTensors, Stage
 from idesplat.export.tracing import StaticShape
 from idesplat.export.validation.cases import Case, verification_cases
@@ -342,7 +342,10 @@ def prepared(small_checkpoint, presets, kept_traces, tmp_path_factory):
     model = small_network()
     assert model.config in PRESETS.values()
     return export_graphs(
-        NamedTensors(model), cli.describe(model, "idesplat-small", "", "", StaticShape()), StaticShape(), folder
+        NamedTensors(model),
+        conversion.build_metadata(model, "idesplat-small", "", "", StaticShape()),
+        StaticShape(),
+        folder,
     )
 
 
@@ -352,7 +355,7 @@ def without_tracing(prepared, monkeypatch):
         shutil.copytree(prepared.folder, folder, dirs_exist_ok=True)
         return type(prepared)(folder, prepared.stages, prepared.nodes)
 
-    monkeypatch.setattr("idesplat.export.tracing.export_graphs", copy)
+    monkeypatch.setattr("idesplat.export.conversion.export_graphs", copy)
 
 
 @pytest.mark.parametrize(("damaged", "form"), (("model.onnx", FUSED), ("gaussians.onnx", STAGED)))
@@ -360,9 +363,7 @@ def test_the_files_that_are_written_are_those_that_were_verified(
     damaged, form, small_checkpoint, without_tracing, tmp_path, monkeypatch, capsys
 ):
     """A component goes wrong between the traced graphs and one of the files; the graphs themselves are sound."""
-    from idesplat.export.graph import external_data as weights
-
-    save_model = weights.save_model
+    save_model = conversion.save_model
 
     def save_damaged(graph, out):
         files = save_model(graph, out)
@@ -370,7 +371,7 @@ def test_the_files_that_are_written_are_those_that_were_verified(
             one_channel(out)
         return files
 
-    monkeypatch.setattr(weights, "save_model", save_damaged)
+    monkeypatch.setattr(conversion, "save_model", save_damaged)
     assert run_command(cli.main, small_checkpoint, tmp_path / "model.onnx", "--staged", tmp_path / "staged") == 1
     assert list(tmp_path.iterdir()) == []
     printed = capsys.readouterr().out
@@ -382,9 +383,7 @@ def test_a_weight_that_hardly_matters_is_compared_too(
     damaged, small_checkpoint, without_tracing, tmp_path, monkeypatch, capsys
 ):
     """One weight is off by a rounding step, which no output shows."""
-    from idesplat.export.graph import external_data as weights
-
-    save_model = weights.save_model
+    save_model = conversion.save_model
 
     def save_damaged(graph, out):
         files = save_model(graph, out)
@@ -395,7 +394,7 @@ def test_a_weight_that_hardly_matters_is_compared_too(
             onnx.save(model, out)
         return files
 
-    monkeypatch.setattr(weights, "save_model", save_damaged)
+    monkeypatch.setattr(conversion, "save_model", save_damaged)
     assert run_command(cli.main, small_checkpoint, tmp_path / "model.onnx", "--staged", tmp_path / "staged") == 2
     assert list(tmp_path.iterdir()) == []
     assert f"{damaged}: its weights" in capsys.readouterr().err

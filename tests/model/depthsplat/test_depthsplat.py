@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from depthsplat_cases import ONE_SCALE, SMALL
-from idesplat.export.cli import describe
+from idesplat.export.conversion import build_metadata
 from idesplat.export.stages import NamedTensors
 from idesplat.export.tracing import StaticShape, export_graphs
 from idesplat.model.common.gather_attention import GatherAttention
@@ -81,7 +81,9 @@ def test_depth_of_several_views(views):
 def test_depth_of_several_views_in_onnx_runtime(views, tmp_path):
     """The graph is traced at four views and another size."""
     expected, *_, model, inputs = views
-    graphs = export_graphs(NamedTensors(model), describe(model, "", "", "", StaticShape()), StaticShape(), tmp_path)
+    graphs = export_graphs(
+        NamedTensors(model), build_metadata(model, "", "", "", StaticShape()), StaticShape(), tmp_path
+    )
     feeds = {name: value.numpy() for name, value in zip(INPUTS, inputs, strict=True)}
     check_depth(torch.from_numpy(run_session(open_session(graphs.whole), feeds)["depth"]), expected)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from idesplat.export.cli import describe
+from idesplat.export.conversion import build_metadata
 from idesplat.export.stages import NamedTensors
 from idesplat.export.tracing import StaticShape, export_graphs
 from idesplat.model.checkpoint import fill
@@ -55,7 +55,7 @@ def in_torch(case):
 def in_onnx(case, tmp_path_factory):
     """What ONNX Runtime makes of the same inputs, stage after stage, each reading what those before it yielded."""
     expected, _, model = case
-    description = describe(model, "reference", "drawn", "", StaticShape())
+    description = build_metadata(model, "reference", "drawn", "", StaticShape())
     graphs = export_graphs(NamedTensors(model), description, StaticShape(), tmp_path_factory.mktemp("graphs"))
     values = {name: value.numpy() for name, value in expected.items()}
     for stage in graphs.stages:

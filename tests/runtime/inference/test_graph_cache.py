@@ -80,7 +80,7 @@ def test_the_second_session_opens_the_optimised_graph_and_gives_the_same(cache, 
 
 
 def test_a_whole_network_gives_the_same_from_the_cache(cache, exported, monkeypatch):
-    from idesplat.export.stages import example_inputs
+    from idesplat.export.example_inputs import example_inputs
 
     feeds = {name: value.numpy() for name, value in example_inputs(2, 64, 96, 0.5, 100.0).items()}
     first = run_session(open_session(exported[0]), feeds)

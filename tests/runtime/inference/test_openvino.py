@@ -8,7 +8,7 @@ import onnxruntime
 import pytest
 from conftest import run_command
 from idesplat import Predictor
-from idesplat.export.stages import example_inputs
+from idesplat.export.example_inputs import example_inputs
 from idesplat.runtime.cli import infer as cli
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.inference import openvino

@@ -8,7 +8,7 @@ import numpy as np
 import onnx
 import pytest
 from idesplat import InputError, Predictor, read_cameras
-from idesplat.export.stages import example_inputs
+from idesplat.export.example_inputs import example_inputs
 from idesplat.runtime.images.io import load_image
 from idesplat.runtime.inference.metadata import INPUTS
 from idesplat.runtime.inference.session import open_session, provider_name

@@ -4,7 +4,7 @@ import numpy as np
 import plyfile
 import pytest
 import trimesh
-from idesplat.export.stages import example_inputs
+from idesplat.export.example_inputs import example_inputs
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.splats.gaussians import Gaussians
 from idesplat.runtime.splats.mesh import faces_from_depth

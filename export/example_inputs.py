@@ -1,10 +1,13 @@
-"""A rendered room for calibration and verification: textured walls and spheres, the same from every camera."""
+"""Example inputs for tracing, calibration and verification: noise, and images of a synthetic room.
+
+Every camera sees the same room, whose walls and spheres are textured.
+"""
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from .stages import example_inputs
+from ..runtime.inference.metadata import INPUTS
 
 # The room: half its width and height, and the depth of its back wall, in a unit that is the near end of the depths.
 HALF_WIDTH, HALF_HEIGHT, BACK = 5.0, 3.0, 16.0
@@ -73,3 +76,21 @@ def _texture(points: np.ndarray) -> np.ndarray:
         amplitude *= CONTRAST * (LOWEST_FREQUENCY / frequency) ** DECAY
         colours += np.sin(points @ (direction * frequency / np.linalg.norm(direction)) + phase)[..., None] * amplitude
     return colours
+
+
+def example_inputs(views: int, height: int, width: int, near: float, far: float) -> dict[str, Tensor]:
+    """Cameras on an arc before a textured scene, and pictures of noise at several scales: every part has work to do."""
+    generator = torch.Generator().manual_seed(views)
+    images = torch.zeros(views, 3, height, width)
+    for size in (2, 4, 8, 16):
+        noise = torch.rand(views, 3, height // size + 1, width // size + 1, generator=generator)
+        images += nn.functional.interpolate(noise, (height, width), mode="bilinear", align_corners=True) / 4
+    angle = torch.linspace(-0.1, 0.1, views)
+    extrinsics = torch.eye(4).repeat(views, 1, 1)
+    extrinsics[:, 0, 0] = extrinsics[:, 2, 2] = angle.cos()
+    extrinsics[:, 0, 2], extrinsics[:, 2, 0] = -angle.sin(), angle.sin()
+    extrinsics[:, 0, 3] = near * torch.linspace(-0.4, 0.4, views)
+    extrinsics[:, 1, 3] = near * 0.1 * torch.rand(views, generator=generator)
+    intrinsics = torch.tensor([[0.9, 0.0, 0.52], [0.0, 0.9, 0.47], [0.0, 0.0, 1.0]]).repeat(views, 1, 1)
+    values = (images, extrinsics, intrinsics, torch.full((views,), near), torch.full((views,), far))
+    return dict(zip(INPUTS, values, strict=True))

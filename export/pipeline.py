@@ -1,0 +1,173 @@
+"""Export of a checkpoint to verified ONNX graphs, as a library function: the whole of `idesplat export`."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..runtime.cli.outputs import Outputs
+from ..runtime.errors import InputError
+from ..runtime.images.sizes import describe_size_rule, is_valid_size
+from ..runtime.inference.metadata import ModelMetadata
+from ..runtime.system.files import check_writable
+from ..runtime.system.progress import ProgressCallback, reporting_to
+
+if TYPE_CHECKING:
+    from .tracing import StaticShape
+    from .validation.compare import TensorError
+
+COMMAND = "idesplat-export"  # in the record of what was written
+# Limits of static shapes: tracing runs the network in PyTorch once, and IDESplat takes some 6 kB a pixel for it.
+MIN_VIEWS, MAX_VIEWS = 2, 64
+MAX_PIXELS = 1 << 24
+
+
+@dataclass(frozen=True)
+class ExportResult:
+    """What an export wrote.
+
+    files: the graph and, where it is too large for one file, its weights; then the staged folder.
+    errors: of every tensor in every verification case against PyTorch, with their bounds.
+    """
+
+    metadata: ModelMetadata
+    files: list[Path]
+    errors: "list[TensorError]"
+
+
+class MismatchError(RuntimeError):
+    """The graphs compute something else than the network in PyTorch, so nothing was written.
+
+    errors: of every tensor in every verification case, with their bounds.
+    """
+
+    def __init__(self, errors: "list[TensorError]") -> None:
+        super().__init__("the graph differs from the network by more than the tolerance; nothing was written")
+        self.errors = errors
+
+
+def export_checkpoint(
+    checkpoint: Path | str,
+    out: Path | str | None = None,
+    staged: Path | str | None = None,
+    *,
+    preset: str | None = None,
+    views: int | None = None,
+    size: tuple[int, int] | None = None,
+    precision: str = "float32",
+    overwrite: bool = False,
+    progress: ProgressCallback | None = None,
+) -> ExportResult:
+    """Write a checkpoint as a standard ONNX graph (opset 20), verified against PyTorch in ONNX Runtime.
+
+    checkpoint: `.ckpt`, `.pth` or `.safetensors`, a released file or one of idesplat-train.
+    out: the `.onnx` file. staged: a folder for one graph a stage, with a manifest; it is replaced as a whole. One of
+    the two is needed.
+    preset: what the file was trained as, where its tensors and its name do not tell.
+    views, size: make the number of views, or the image's height and width, static; else they stay dynamic.
+    precision: "float32", "int8" (for CPUs) or "fp16" (for GPUs).
+    overwrite: also replace a file at `out` that idesplat did not write.
+    progress: called as the work advances; by default reports go where the caller's `reporting_to` sends them.
+    Raises InputError if an argument or the file is unusable, or PyTorch is not installed; MismatchError if a tensor's
+    error exceeds its bound.
+    """
+    checkpoint = Path(checkpoint)
+    out, staged = (Path(path) if path is not None else None for path in (out, staged))
+    with reporting_to(progress) if progress else nullcontext(), Outputs(COMMAND, overwrite) as outputs:
+        with _os_errors_as_input_errors("choose another name"):
+            staged = staged.resolve() if staged is not None and staged.is_symlink() else staged
+            outputs.reads("the checkpoint", [checkpoint])
+            _check_targets(outputs, out, staged)
+        _require_pytorch()
+        from . import conversion
+
+        _check_precision(precision)
+        with _os_errors_as_input_errors("choose another name"):
+            _check_existing(outputs, out, staged)
+        loaded = conversion.load(checkpoint, preset)
+        static = _static_shape(views, size, loaded.model.config.size_multiple)
+        metadata = conversion.build_metadata(
+            loaded.model, loaded.preset, checkpoint.name, loaded.sha256, static, precision
+        )
+        with _os_errors_as_input_errors("choose a folder on a disk with room for it"):
+            errors, files = conversion.convert(loaded.model, metadata, static, out, staged)
+        if not files:
+            raise MismatchError(errors)
+    return ExportResult(metadata, files, errors)
+
+
+@contextmanager
+def _os_errors_as_input_errors(remedy: str) -> Iterator[None]:
+    """Raise InputError for a path's errors of the system: a name too long, links in a circle, a full disk."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "Symlink loop" not in str(error):
+            raise
+        raise InputError(f"cannot write the result ({error}); {remedy}") from None
+
+
+def _require_pytorch() -> None:
+    if find_spec("torch") is None or find_spec("onnx") is None:
+        raise InputError("exporting needs PyTorch and onnx, which are not installed; pip install 'idesplat[export]'")
+
+
+def _check_targets(outputs: Outputs, out: Path | None, staged: Path | None) -> None:
+    """Check, before minutes of work, whether the results can be written."""
+    if out is None and staged is None:
+        raise InputError("nothing to write: give OUT.onnx, or --staged DIR, or both")
+    if out is not None:
+        if out.suffix != ".onnx":
+            raise InputError(f"{out}: the output must end in .onnx")
+        outputs.make_folder(out.parent)
+        check_writable(out.parent)
+    if staged is not None:
+        if staged.exists() and not staged.is_dir():
+            raise InputError(f"--staged {staged}: is a file, expected a folder")
+        if out is not None and staged.resolve() in (out.resolve(), *out.resolve().parents):
+            raise InputError(f"--staged {staged}: is replaced as a whole; choose a place outside it for {out}")
+        outputs.writes_into("--staged", staged)
+        outputs.make_folder(staged.parent)
+        check_writable(staged.parent)
+
+
+def _check_precision(precision: str) -> None:
+    from .precision.convert import PRECISIONS
+
+    if precision not in PRECISIONS:
+        raise InputError(f"--precision {precision}: unknown; choose one of {', '.join(PRECISIONS)}")
+
+
+def _check_existing(outputs: Outputs, out: Path | None, staged: Path | None) -> None:
+    """Raise InputError if the results would replace anything that idesplat-export did not write."""
+    from .existing_exports import check_replaceable, is_our_graph
+
+    if out is not None:
+        outputs.writes("", [out], known=is_our_graph(out))
+    if staged is not None and staged.is_dir():
+        check_replaceable(staged)
+
+
+def _static_shape(views: int | None, size: tuple[int, int] | None, multiple: int) -> "StaticShape":
+    """The static views and size; raises InputError unless the network can be traced with them.
+
+    multiple: of which height and width must be.
+    """
+    from .tracing import StaticShape
+    from .validation.cases import MAX_CASE_VIEWS
+
+    if views is not None and not MIN_VIEWS <= views <= MAX_VIEWS:
+        raise InputError(f"--views {views}: expected {MIN_VIEWS} to {MAX_VIEWS}")
+    if size is not None:
+        height, width = size
+        if not is_valid_size(height, width, multiple):
+            raise InputError(f"--size {height}x{width}: {describe_size_rule(multiple)}")
+        count = views or MAX_CASE_VIEWS
+        if count * height * width > MAX_PIXELS:
+            raise InputError(
+                f"--size {height}x{width}: {count} views of it have more than {MAX_PIXELS:,} pixels; "
+                "choose a smaller one"
+            )
+    return StaticShape(views, size)
