@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from .runtime import startup as startup
 
 if TYPE_CHECKING:
+    from .export.pipeline import export_checkpoint
     from .runtime.cameras.camera import Camera
     from .runtime.cameras.io import read_cameras, write_cameras
     from .runtime.errors import InputError
@@ -36,6 +37,7 @@ _MODULE_OF = {
     "Predictor": "runtime.inference.predictor",
     "bundled_model": "runtime.inference.bundled_model",
     "estimate_cameras": "runtime.sfm.estimate",
+    "export_checkpoint": "export.pipeline",
     "evaluate": "tools.evaluation.evaluate",
     "rasterize": "runtime.rendering.rasterizer",
     "read_cameras": "runtime.cameras.io",
@@ -60,6 +62,7 @@ __all__ = [
     "bundled_model",
     "estimate_cameras",
     "evaluate",
+    "export_checkpoint",
     "rasterize",
     "read_cameras",
     "read_offset",
