@@ -56,9 +56,11 @@ def bench(
 ) -> None:
     """Measure time and memory of exported models, each in a fresh process; Ctrl-C keeps finished workloads."""
     if training:
-        from .training import bench_training
+        from .training import benchmark_training, print_training
 
-        bench_training(repeats, STEPS_OF_A_ROUND)
+        with _status() as status:
+            found = benchmark_training(repeats, STEPS_OF_A_ROUND, status)
+        print_training(found)
         return
     from .report import compare as compare_rows
     from .report import print_rows, read_rows, write_rows

@@ -1,4 +1,4 @@
-"""idesplat-bench --training: scenes a second of training configurations side by side, and where a step's time goes."""
+"""Benchmark of training: scenes per second of configurations, interleaved, and the shares of a step's time."""
 
 import json
 import os
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from ..training.parallel import ProcessGroup
     from ..training.trainer import Trainer
 
-# The run that the phases are taken of; only the place of a phase in it matters.
+# Length of the run whose phases are measured.
 STEPS = 1000
-# Steps that are not measured: code is compiled and textures are generated in them.
+# Steps before the measurement, in which code is compiled and textures are generated.
 WARM_UP = 1
 SIZE = 256
 
@@ -40,24 +40,35 @@ class Candidate:
         return f"{self.preset}, {self.precision}, {self.processes} process(es), {self.batch} scene(s)"
 
 
-# As training was, and as it is.
+# The first configuration that was trained, and the present one.
 CANDIDATES = (Candidate("idesplat-tiny", "float32", 1, 1), Candidate("idesplat-lite", "bf16", 2, 4))
 # Step of the run at which a phase begins, by what it trains.
 PHASES = {"128x128, first DPBU": 0, "256x256, everything": 900}
 
 
-def bench_training(rounds: int, steps: int) -> None:
-    """Measure every candidate in every phase, interleaved, each in new processes; print a table."""
+# By phase and candidate: the rounds' seconds, CPU seconds, scenes, and seconds by part of a step.
+Measured = dict[tuple[str, Candidate], list[dict[str, Any]]]
+
+
+def benchmark_training(rounds: int, steps: int, on_status: Callable[[str], None] = lambda status: None) -> Measured:
+    """Measure every candidate in every phase, interleaved, each in new processes.
+
+    steps: of each measurement. on_status: receives what is being done. Raises InputError if a process fails.
+    """
+    found: Measured = defaultdict(list)
+    for turn in range(rounds):
+        for phase in PHASES:
+            for candidate in CANDIDATES:
+                on_status(f"round {turn + 1} of {rounds}: {phase}, {candidate.name}")
+                found[phase, candidate].append(_measure(phase, candidate, steps))
+    return found
+
+
+def print_training(found: Measured) -> None:
+    """Print the best round of every candidate in every phase."""
     from rich.console import Console
     from rich.table import Table
 
-    found: dict[tuple[str, Candidate], list[dict[str, Any]]] = defaultdict(list)
-    with Console(stderr=True).status("training") as status:
-        for turn in range(rounds):
-            for phase in PHASES:
-                for candidate in CANDIDATES:
-                    status.update(f"round {turn + 1} of {rounds}: {phase}, {candidate.name}")
-                    found[phase, candidate].append(_measure(phase, candidate, steps))
     table = Table("phase", "training", "scenes/s", "CPU s/scene", "where the time goes", title="best of the rounds")
     for (phase, candidate), measured in found.items():
         best = min(measured, key=lambda one: one["seconds"])
@@ -79,7 +90,7 @@ def _measure(phase: str, candidate: Candidate, steps: int) -> dict[str, Any]:
 
 
 def _worker(phase: str, candidate: Candidate, steps: int) -> None:
-    """What the process of a measurement does; it prints seconds, CPU seconds of all processes, scenes and shares."""
+    """The main process of a measurement; prints seconds, CPU seconds of all processes, scenes and shares as JSON."""
     from ..training.parallel import ProcessGroup, spawn_workers
 
     with scratch_folder() as folder:
@@ -93,7 +104,7 @@ def _other(group: "ProcessGroup", folder: Path, phase: str, candidate: Candidate
 
 
 def _run_at(folder: Path, phase: str, candidate: Candidate, group: "ProcessGroup") -> "Trainer":
-    """A new run that stands at the beginning of a phase."""
+    """A new trainer at the beginning of a phase."""
     from ..training.settings import TrainingSettings, network_config
     from ..training.trainer import Trainer
 
@@ -107,7 +118,7 @@ def _run_at(folder: Path, phase: str, candidate: Candidate, group: "ProcessGroup
 
 
 def _timed_steps(run: "Trainer", steps: int) -> dict[str, Any]:
-    """Make some steps after the warm-up; CPU seconds are summed over the team."""
+    """Make some steps after the warm-up; CPU seconds are summed over the processes."""
     from ..training.data.samples import prefetch
 
     scenes = prefetch(run.specs(), run.task.load)
@@ -127,7 +138,7 @@ def _timed_steps(run: "Trainer", steps: int) -> dict[str, Any]:
 
 
 def _timed_parts(run: "Trainer") -> dict[str, float]:
-    """Seconds by part of a step from now on: the network's forward stages, losses, exchange and optimiser."""
+    """Seconds by part of a step, updated from now on: the network's stages, losses, all-reduce and optimiser."""
     parts: dict[str, float] = defaultdict(float)
 
     def timed(name: str, call: Callable[..., Any]) -> Callable[..., Any]:
@@ -141,7 +152,7 @@ def _timed_parts(run: "Trainer") -> dict[str, float]:
 
     for name, stage in run.state.model.named_children():
         stage.forward = timed(name, stage.forward)
-    changed: Any = run  # methods of single objects are replaced
+    changed: Any = run  # methods of these objects are replaced
     changed.task.loss = timed("rendering and losses", run.task.loss)
     changed.group.all_reduce_gradients = timed("waiting and exchange", run.group.all_reduce_gradients)
     changed.state.update = timed("optimiser", run.state.update)
@@ -149,7 +160,7 @@ def _timed_parts(run: "Trainer") -> dict[str, float]:
 
 
 def _timed(scenes: Iterator[Any], parts: dict[str, float]) -> Iterator[Any]:
-    """The same scenes; what is waited for them counts as a part."""
+    """The same scenes; the time spent waiting for them counts as a part."""
     while True:
         started = time.perf_counter()
         scene = next(scenes)

@@ -1,8 +1,8 @@
-"""How far depth moves where one part of a network multiplies in bfloat16: numbers for docs/performance.md.
+"""Change of predicted depth when one part of a network multiplies in bfloat16: numbers for docs/performance.md.
 
 python -P -m idesplat.tools.figures.bfloat16 [MODEL]
 
-What a processor does that multiplies in bfloat16 and adds in float32 is done by hand: operands are rounded before.
+A CPU that multiplies in bfloat16 and accumulates in float32 is emulated: operands are rounded before each matmul.
 """
 
 from pathlib import Path
@@ -31,7 +31,7 @@ def main(
     model: Annotated[Path | None, typer.Argument(help="A .onnx file instead of the bundled model.")] = None,
     scenes: Annotated[int, typer.Option(help="Held-out synthetic scenes to measure on.", min=1)] = 3,
 ) -> None:
-    """Round the operands of one part after the other, and compare depth with that of the model as it is."""
+    """Round the operands of one part at a time, and compare depth with that of the float32 model."""
     path = model or bundled_model()
     own = read_model(path).metadata
     cases = [synthetic_case(seed, VIEWS, VIEWS, 1, own.height, own.width) for seed in HELD_OUT_SEEDS[:scenes]]
@@ -58,7 +58,7 @@ def main(
 
 
 def _rounded(graph: onnx.ModelProto, part: str, weighted: bool) -> onnx.ModelProto:
-    """A graph whose products in one part, or those of them with trained weights, read operands in bfloat16."""
+    """The graph with bfloat16 operands of one part's matmuls; weighted: only of those with trained weights."""
     copy = onnx.ModelProto()
     copy.CopyFrom(graph)
     weights = {tensor.name for tensor in graph.graph.initializer}
@@ -79,7 +79,7 @@ def _rounded(graph: onnx.ModelProto, part: str, weighted: bool) -> onnx.ModelPro
 
 
 def _rounding(name: str) -> tuple[onnx.NodeProto, onnx.NodeProto]:
-    """Nodes that take a tensor to bfloat16 and back."""
+    """Nodes that cast a tensor to bfloat16 and back."""
     short = f"{name}.bfloat16"
     return (
         onnx.helper.make_node("Cast", [name], [short], name=short, to=onnx.TensorProto.BFLOAT16),
@@ -93,7 +93,7 @@ def _depths(graph: onnx.ModelProto, feeds: list[dict[str, np.ndarray]]) -> list[
 
 
 def _change(found: list[np.ndarray], exact: list[np.ndarray]) -> float:
-    """The median relative difference of the scene in which it is largest."""
+    """The largest of the scenes' median relative differences."""
     return max(float(np.median(np.abs(a / b - 1))) for a, b in zip(found, exact, strict=True))
 
 

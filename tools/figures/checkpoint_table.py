@@ -1,12 +1,11 @@
-"""The README's table of supported checkpoints, every number of it measured where this runs.
+"""The table of supported checkpoints for the documentation, with every number measured on this machine.
 
     python -P -m idesplat.tools.figures.checkpoint_table
     python -P -m idesplat.tools.figures.checkpoint_table depthsplat-small-re10k depthsplat-base-re10k
 
-Each preset's weights are drawn at random and exported by idesplat-export, and what comes of it is run, each in a
-process of its own. Time and memory do not depend on the weights. Parity is, if anything, worse than with trained ones,
-since the features of neighbouring pixels then have nothing in common. Seconds are a processor's on one thread, which do
-not change when others use the machine, too.
+Each preset's network gets random weights, is exported by idesplat-export and run, each in a process of its own. Time
+and memory do not depend on the weights. Parity is not better than with trained weights, since features of neighbouring
+pixels are then uncorrelated. Seconds are CPU time of one thread, which does not depend on the load of the machine.
 """
 
 import math
@@ -32,7 +31,7 @@ from ...runtime.inference.session import CPU
 from ..benchmark.runner import thread_environment
 from ..benchmark.worker import Failed, Prepared, Worker, Workload, example_arrays, exported
 
-# Released files by the preset that they fit; the asterisk stands for what we have not seen of a name.
+# Released files by preset; an asterisk stands for an unknown part of the name.
 RELEASED = {
     "idesplat-re10k": "idesplat-re10k-256x256-view2.ckpt",
     "idesplat-acid": "idesplat-acid-*.ckpt",
@@ -47,12 +46,12 @@ RELEASED = {
     "depthsplat-depth-small": "depthsplat-depth-small-352x640-randview2-8-e807bd82.pth",
     "depthsplat-depth-base": "depthsplat-depth-base-352x640-randview2-8-65a892c5.pth",
 }
-# How the references' weights were drawn.
+# Scales of the random weights, as in the reference cases.
 GAIN = 0.7
 BIAS = 0.1
 TABLES = 0.02
 VIEWS = 2
-WITHIN = 1e-3
+TOLERANCE = 1e-3
 COLUMNS = (
     "checkpoint",
     "family",
@@ -71,10 +70,10 @@ GB = 1e9
 
 @dataclass(frozen=True)
 class Measured:
-    """What is measured of one preset on two views of the trained size, and of its export."""
+    """Measurements of one preset on two views of the trained size, and of its export."""
 
     parameters: int
-    share: float  # of depths within `WITHIN` of PyTorch's, relative
+    share: float  # of depths whose relative difference from PyTorch is at most `TOLERANCE`
     median: float  # relative error
     seconds: float
     peak_bytes: int
@@ -124,12 +123,12 @@ def row(preset: str, found: Measured) -> str:
 
 
 def measure(preset: str, repeats: int) -> Measured:
-    """Draw a checkpoint, export it and run what comes of it. Raises Failed if that cannot be done."""
+    """Write a checkpoint with random weights, export it and run the graph. Raises Failed if that fails."""
     config = PRESETS[preset]
     workload = Workload(VIEWS, config.height, config.width)
     with tempfile.TemporaryDirectory() as folder:
-        checkpoint, model = Path(folder) / "drawn.pth", Path(folder) / "model.onnx"
-        with Worker(drawn, preset, checkpoint, workload) as worker:
+        checkpoint, model = Path(folder) / "random.pth", Path(folder) / "model.onnx"
+        with Worker(reference, preset, checkpoint, workload) as worker:
             parameters, depth = worker.about
         with Worker(exporting, checkpoint, preset, model) as worker:
             export_seconds = worker.run().result
@@ -139,15 +138,15 @@ def measure(preset: str, repeats: int) -> Measured:
             error = np.abs(worker.about["depth"] - depth) / depth
             peak = worker.finish()
         size = sum(path.stat().st_size for path in Path(folder).glob("model.onnx*"))
-    share, median = float((error <= WITHIN).mean()), float(np.median(error))
+    share, median = float((error <= TOLERANCE).mean()), float(np.median(error))
     return Measured(parameters, share, median, seconds, peak or 0, size, export_seconds, export_peak or 0)
 
 
-# ---- what runs in processes of its own
+# ---- candidates, each in a process of its own
 
 
-def drawn(preset: str, checkpoint: Path, workload: Workload) -> Prepared:
-    """Write drawn weights; `about` holds how many they are, and the depth that PyTorch makes of them."""
+def reference(preset: str, checkpoint: Path, workload: Workload) -> Prepared:
+    """Write a checkpoint of random weights; `about` holds their number, and the depth that PyTorch predicts."""
     network = build(preset).eval()
     randomize_weights(network)
     torch.save({"state_dict": network.state_dict()}, checkpoint)
@@ -161,9 +160,9 @@ def drawn(preset: str, checkpoint: Path, workload: Workload) -> Prepared:
 
 
 def exporting(checkpoint: Path, preset: str, model: Path) -> Prepared:
-    """The export; a run gives its processor seconds."""
+    """The export; a run gives its CPU seconds."""
 
-    # ONNX Runtime takes as many threads as there are cores to run on, and its idle ones would count as well.
+    # ONNX Runtime starts a thread for each usable core, and idle threads would add CPU time.
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 
@@ -174,13 +173,13 @@ def exporting(checkpoint: Path, preset: str, model: Path) -> Prepared:
 
 
 def running(model: Path, workload: Workload) -> Prepared:
-    """The exported model; `about` holds the depth that it predicts, and a run gives its processor seconds."""
+    """The exported model; `about` holds its predicted depth, and a run gives its CPU seconds."""
     about, run = exported(model, CPU, 1, workload)
     return about, _timed(run)
 
 
 def _timed(run: Callable[[], object]) -> Callable[[], float]:
-    """What runs something and says how long the processor worked on it."""
+    """A function that runs another and returns the CPU seconds."""
 
     def timed() -> float:
         started = time.process_time()
@@ -191,7 +190,7 @@ def _timed(run: Callable[[], object]) -> Callable[[], float]:
 
 
 def randomize_weights(network: Network, seed: int = 0) -> None:
-    """Fill a network with random weights that let signals through, as the reference cases have them."""
+    """Fill a network with random weights that preserve the signal's magnitude, as in the reference cases."""
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         for name, parameter in network.named_parameters():

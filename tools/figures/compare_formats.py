@@ -1,4 +1,4 @@
-"""What each splat format costs and keeps: bytes, seconds, and the image drawn from what comes back.
+"""Size, time and fidelity of each splat format: numbers for docs/formats.md.
 
 python -P -m idesplat.tools.figures.compare_formats --gaussians 131072
 """
@@ -20,11 +20,11 @@ from ..evaluation.metrics import psnr
 
 VIEWS = 2
 SIDE = 256  # of the image
-SH_SPREAD = (0.025, 0.006)  # standard deviations of degree 1 and 2: what networks predict changes little with direction
+SH_SPREAD = (0.025, 0.006)  # standard deviation at degree 1 and 2: networks predict little view dependence
 
 
-def made_up_scene(gaussians: int) -> Gaussians:
-    """About as many Gaussians as asked for, like a network's: two rippled depth maps of a board before a wall."""
+def example_scene(gaussians: int) -> Gaussians:
+    """About as many Gaussians as asked for, one for each pixel of two depth maps, as a network predicts them."""
     side = round((gaussians / VIEWS) ** 0.5)
     rng = np.random.default_rng(0)
     y, x = np.mgrid[:side, :side] / side
@@ -49,9 +49,9 @@ def made_up_scene(gaussians: int) -> Gaussians:
 
 @exit_on_input_error
 def compare(gaussians: Annotated[int, typer.Option(help="How many.", min=100)] = 131_072) -> None:
-    """Print processor seconds to write and to read, megabytes, and PSNR of the image for each format."""
-    scene = made_up_scene(gaussians)
-    drawn = _draw(scene)
+    """Print for each format CPU seconds to write and read, megabytes, and PSNR of a render after reading it back."""
+    scene = example_scene(gaussians)
+    rendered = _render(scene)
     say(f"{len(scene):,} Gaussians", f"{'format':16}{'write, s':>10}{'read, s':>10}{'MB':>8}{'PSNR, dB':>10}")
     with tempfile.TemporaryDirectory() as folder:
         for suffix in FORMATS:
@@ -61,13 +61,13 @@ def compare(gaussians: Annotated[int, typer.Option(help="How many.", min=100)] =
             written = time.process_time()
             back = read_splats(path)
             read = time.process_time()
-            quality = psnr(_draw(back), drawn, np.ones(drawn.shape[:2], bool))
+            quality = psnr(_render(back), rendered, np.ones(rendered.shape[:2], bool))
             megabytes = path.stat().st_size / 1e6
             say(f"{suffix:16}{written - started:10.2f}{read - written:10.2f}{megabytes:8.1f}{quality:10.1f}")
 
 
-def _draw(scene: Gaussians) -> np.ndarray:
-    """The scene from between the views."""
+def _render(scene: Gaussians) -> np.ndarray:
+    """Render the scene from between the views."""
     extrinsics = np.eye(4)
     extrinsics[0, 3] = 0.1
     K = np.array([[SIDE, 0, SIDE / 2], [0, SIDE, SIDE / 2], [0, 0, 1.0]])

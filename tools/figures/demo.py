@@ -1,4 +1,4 @@
-"""The main job on a scene drawn here: images and cameras, and what the bundled model makes of them.
+"""`make demo`: a synthetic scene, and its reconstruction by the bundled model.
 
 python -P -m idesplat.tools.figures.demo demo
 """
@@ -20,7 +20,7 @@ from ..synthetic.make_scene import make_scene
 def demo(
     out: Annotated[Path, typer.Argument(help="Folder for everything.")] = Path("demo"), overwrite: Overwrite = False
 ) -> None:
-    """Draw a room, and turn two images of it into splats, depth maps and views."""
+    """Render images of a synthetic room, and reconstruct splats, depth maps and views from two of them."""
     scene = out / "scene"
     outputs().writes("", [out / "scene.ply", out / "summary.json"])
     make_scene(scene, seed=2, views=8, height=480, width=640, overwrite=overwrite)

@@ -1,4 +1,4 @@
-"""The README's image: what the bundled model makes of two images of the drawn room.
+"""The README's image: input, depth, rendered held-out view and truth, of the synthetic room by the bundled model.
 
 python -P -m idesplat.tools.figures.readme_picture demo/scene docs/images/picture.png
 """
@@ -19,8 +19,7 @@ from ...runtime.inference.predictor import Predictor
 from ...runtime.rendering.render import render_view
 from ...runtime.views.batch import build_view_batch
 
-# Two images, and one between them that the model is not given.
-CONTEXT, BETWEEN = (1, 3), 2
+CONTEXT, HELD_OUT = (1, 3), 2
 
 
 @exit_on_input_error
@@ -28,18 +27,18 @@ def image(
     scene: Annotated[Path, typer.Argument(help="Folder that make_scene wrote.", show_default=False)],
     out: Annotated[Path, typer.Argument(help="The .png to write.", show_default=False)],
 ) -> None:
-    """Draw image, its depth, the view between from splats, the image there, and the other image."""
+    """Write a strip: first input, its depth, the held-out view rendered and as it is, second input."""
     cameras = read_cameras(scene / "transforms.json")
     predictor = Predictor(bundled_model())
     height, width = predictor.model.size_for(cameras)
-    pairs = [(scene / cameras[view].name, cameras[view]) for view in (*CONTEXT, BETWEEN)]
+    pairs = [(scene / cameras[view].name, cameras[view]) for view in (*CONTEXT, HELD_OUT)]
     given = build_view_batch(pairs[: len(CONTEXT)], None, height, width)
     found = predictor.predict_views(given)
     views = build_view_batch(pairs, None, height, width)
     pixels = views.intrinsics[-1].astype(np.float64) * np.array([width, height, 1.0])[:, None]
-    between = render_view(found.need_gaussians(), views.extrinsics[-1], pixels, width, height).rgb
+    rendered = render_view(found.need_gaussians(), views.extrinsics[-1], pixels, width, height).rgb
     first, second, truth = views.images.transpose(0, 2, 3, 1)
-    save_png(out, np.hstack([first, colormap_depth(found.depth[0]), between, truth, second]).astype(np.float32))
+    save_png(out, np.hstack([first, colormap_depth(found.depth[0]), rendered, truth, second]).astype(np.float32))
     say(f"wrote {out}")
 
 

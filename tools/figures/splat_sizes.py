@@ -1,8 +1,8 @@
-"""How large a pixel's splat should be: PSNR by size, of views as large as the images and closer.
+"""Size of oracle-depth splats: PSNR by splat size, at the images' own size and zoomed in.
 
     python -P -m idesplat.tools.figures.splat_sizes --scenes 24
 
-Small splats hide little of their neighbours and are best at the images' own size; seen closer they leave gaps.
+Small splats occlude little of their neighbours and score best at the images' own size; zoomed in, they leave gaps.
 """
 
 from dataclasses import replace
@@ -26,7 +26,7 @@ from ..evaluation.metrics import psnr
 from ..evaluation.novel_views import render_target
 from ..synthetic.sampler import HELD_OUT_SEEDS
 
-CLOSER = (1, 2, 4)
+ZOOMS = (1, 2, 4)
 SIZES = (0.3, 0.35, 0.4, 0.45, 0.5, 0.6)  # pixels
 VIEWS, TARGETS = 2, 2
 OWN = "model"
@@ -37,21 +37,21 @@ def main(
     model: Annotated[Path | None, typer.Argument(help="A .onnx file instead of the bundled model.")] = None,
     scenes: Annotated[int, typer.Option(help="Held-out synthetic scenes.", min=1)] = 24,
 ) -> None:
-    """Draw held-out scenes from splats of several sizes at the true depth, and from the model's own, where seen."""
+    """Compare oracle-depth splats of several sizes and the model's splats on held-out scenes."""
     predictor = Predictor(model or bundled_model())
-    table = Table("times as large", *(f"{size:g} pixels" for size in SIZES), OWN, title="PSNR, dB, co-visible pixels")
+    table = Table("zoom", *(f"{size:g} pixels" for size in SIZES), OWN, title="PSNR, dB, co-visible pixels")
     console = Console(stderr=True)
-    for closer in CLOSER:
-        seeds = track(HELD_OUT_SEEDS[:scenes], f"{closer} times as large", console=console, transient=True)
-        rows = [row for seed in seeds for row in _measured(predictor, seed, closer)]
-        table.add_row(str(closer), *(f"{value:.2f}" for value in np.mean(rows, axis=0)))
+    for zoom in ZOOMS:
+        seeds = track(HELD_OUT_SEEDS[:scenes], f"{zoom} times zoomed", console=console, transient=True)
+        rows = [row for seed in seeds for row in _measured(predictor, seed, zoom)]
+        table.add_row(str(zoom), *(f"{value:.2f}" for value in np.mean(rows, axis=0)))
     Console().print(table)
 
 
-def _measured(predictor: Predictor, seed: int, closer: int) -> list[list[float]]:
-    """For each target of a scene its PSNR, dB, by size of the splats, and last by the model's own."""
+def _measured(predictor: Predictor, seed: int, zoom: int) -> list[list[float]]:
+    """PSNR in dB of each target of a scene, by splat size; last, of the model's splats."""
     own = predictor.metadata
-    case = synthetic_case(seed, VIEWS, VIEWS, TARGETS, own.height, own.width, closer)
+    case = synthetic_case(seed, VIEWS, VIEWS, TARGETS, own.height, own.width, zoom)
     given = case.context
     predicted = predictor.predict_arrays(given.images, given.extrinsics, given.intrinsics, case.near, case.far)
     assert case.depth is not None
