@@ -1,1 +1,1 @@
-"""Synthetic scenes: layout, textures and a ray caster."""
+"""Synthetic scenes: layouts, textures, and a ray caster with exact depth."""

@@ -1,10 +1,10 @@
-"""The command `python -P -m idesplat.tools.synthetic.make_scene`: a procedural room as photographs, cameras and depth.
+"""The command `python -P -m idesplat.tools.synthetic.make_scene`: a synthetic room as images, cameras and depth.
 
-    OUT_DIR/images/000.png ...     the photographs
+    OUT_DIR/images/000.png ...     the images
     OUT_DIR/transforms.json        their cameras, as nerfstudio writes them
     OUT_DIR/depth/000.npz ...      exact z-depth at the pixel centres, `depth` [height, width], in scene units
 
-What needs photographs with known cameras and known truth can be tried on it, without a download.
+It serves wherever images with known cameras and depth are needed, without a download.
 """
 
 import json
@@ -21,31 +21,31 @@ from ...runtime.cli.terminal import run, say
 from ...runtime.errors import exit_on_input_error
 from ...runtime.system.files import atomic_write
 
-if TYPE_CHECKING:  # compiled code is loaded only once there is something to draw
+if TYPE_CHECKING:  # for a fast start: the ray caster is loaded when it is needed
     from .layout import Layout
 
 OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
-SEED = 2  # a room that is pleasant to look at
+SEED = 2  # of the room in the documentation
 FIELD_OF_VIEW = 62.0  # degrees, of the longer side
-PATH_LENGTH = 0.3  # of the median depth, from the first view to the last
-SAMPLES = 12  # rays for a pixel's colour
-BRIGHTNESS = 0.45  # mean of all pictures
-CANDIDATES = 60  # paths, of which the one with the richest views is taken
-CLEARANCE = 0.3  # of the median depth, before every camera
-LAMP = 0.3  # half length of the lamp that casts shadows, in scene units
+PATH_LENGTH = 0.3  # from the first camera to the last, relative to the median depth
+SAMPLES = 12  # rays per pixel
+BRIGHTNESS = 0.45  # mean of the first image
+CANDIDATES = 60  # random camera paths, of which the best is taken
+CLEARANCE = 0.3  # least depth in view, relative to the median depth
+LAMP = 0.3  # half length of the lamp that casts shadows, in metres
 
 
 @exit_on_input_error
 @guards_outputs("make_scene")
 def make_scene(
     out_dir: Annotated[Path, typer.Argument(help="Folder to write to.", show_default=False)],
-    seed: Annotated[int, typer.Option(help="Another number gives another room.", min=0)] = SEED,
-    views: Annotated[int, typer.Option(help="Photographs, along a gentle path.", min=2, max=1000)] = 8,
-    height: Annotated[int, typer.Option(help="Of a photograph, in pixels.", min=16, max=8192)] = 480,
-    width: Annotated[int, typer.Option(help="Of a photograph, in pixels.", min=16, max=8192)] = 640,
+    seed: Annotated[int, typer.Option(help="Random seed of the room.", min=0)] = SEED,
+    views: Annotated[int, typer.Option(help="Number of images, along an arc.", min=2, max=1000)] = 8,
+    height: Annotated[int, typer.Option(help="Of the images, in pixels.", min=16, max=8192)] = 480,
+    width: Annotated[int, typer.Option(help="Of the images, in pixels.", min=16, max=8192)] = 640,
     overwrite: Overwrite = False,
 ) -> None:
-    """Draw photographs of a furnished room that exists only in numbers, with its cameras and exact depth."""
+    """Render images of a synthetic furnished room, with its cameras and exact depth."""
     from ...runtime.images.png import save_png
     from .layout import furnished_room
     from .sampler import render, scene_textures
@@ -71,7 +71,7 @@ def make_scene(
             np.savez_compressed(temporary, depth=depth)
     with atomic_write(cameras) as temporary:
         temporary.write_text(json.dumps(_transforms(poses, intrinsics, width, height), indent=1) + "\n")
-    say(f"{views} photographs in {images}, their cameras in {cameras}, true depth in {depths}")
+    say(f"{views} images in {images}, their cameras in {cameras}, true depth in {depths}")
 
 
 def main() -> None:
@@ -80,30 +80,30 @@ def main() -> None:
 
 
 def _intrinsics(width: int, height: int) -> np.ndarray:
-    """A camera of FIELD_OF_VIEW, row 0 divided by the width, row 1 by the height, [3, 3]."""
+    """Normalised intrinsics of FIELD_OF_VIEW: row 0 divided by the width, row 1 by the height, [3, 3]."""
     focal = 0.5 / np.tan(np.radians(FIELD_OF_VIEW) / 2) * max(width, height)  # pixels
     return np.array([[focal / width, 0, 0.5], [0, focal / height, 0.5], [0, 0, 1]])
 
 
 def _path(rng: np.random.Generator, layout: "Layout", intrinsics: np.ndarray, views: int) -> np.ndarray:
-    """Camera-to-world poses [views, 4, 4] on a shallow arc: the one of CANDIDATES whose ends see the most relief."""
-    from .sampler import look_at, probe, relief
+    """Camera-to-world poses [views, 4, 4] on a shallow arc: of CANDIDATES, that with the most depth edges in view."""
+    from .sampler import depth_edge_share, look_at, probe
 
     best, best_score = np.empty(0), -np.inf
     for _ in range(CANDIDATES):
-        middle = look_at(rng.uniform(*layout.eyes), rng.uniform(*layout.focus))
+        middle = look_at(rng.uniform(*layout.eye_bounds), rng.uniform(*layout.focus_bounds))
         distance = float(np.median(probe(layout.scene, middle, intrinsics)))
         poses = _arc(middle, distance, views)
         seen = [probe(layout.scene, pose, intrinsics) for pose in (poses[0], middle, poses[-1])]
-        room_before = min(depth.min() for depth in seen) / distance
-        score = min(relief(depth) for depth in seen) if room_before > CLEARANCE else room_before - CLEARANCE
+        clearance = min(depth.min() for depth in seen) / distance
+        score = min(depth_edge_share(depth) for depth in seen) if clearance > CLEARANCE else clearance - CLEARANCE
         if score > best_score:
             best, best_score = poses, score
     return best
 
 
 def _arc(middle: np.ndarray, distance: float, views: int) -> np.ndarray:
-    """Poses [views, 4, 4] to both sides of `middle`, which look to a point behind what it sees at `distance`."""
+    """Poses [views, 4, 4] to both sides of `middle`, looking at a point at 1.5 times `distance` in front of it."""
     from .sampler import look_at
 
     right, down, forward, eye = middle[:3].T
@@ -125,13 +125,13 @@ def _transforms(poses: np.ndarray, intrinsics: np.ndarray, width: int, height: i
 
 
 def _with_progress(poses: np.ndarray) -> Iterable[np.ndarray]:
-    """The poses, with a bar on stderr where that is a terminal."""
+    """The poses, with a progress bar on stderr if that is a terminal."""
     if not sys.stderr.isatty():
         return poses
     from rich.console import Console
     from rich.progress import track
 
-    return track(poses, "Drawing", console=Console(stderr=True))
+    return track(poses, "rendering", console=Console(stderr=True))
 
 
 if __name__ == "__main__":

@@ -1,55 +1,33 @@
-"""A compiled ray caster: exact z-depth and antialiased colour of scenes made of boxes, ellipsoids and cylinders.
+"""A compiled ray caster: exact z-depth and antialiased color of boxes, ellipsoids and cylinders.
 
-Rays keep z = 1 in the camera frame, so that the ray parameter is the z-depth. Every solid is the unit cube, ball or
-cylinder in a frame of its own (`halves` stretch it), which leaves three short intersection routines. Per tile of the
-image only the solids whose outline can touch it are tried, nearest first.
+Ray directions have z = 1 in the camera frame, so that the ray parameter is the z-depth. Each solid is a unit cube, ball
+or cylinder in its own frame, scaled by `halves`. For each tile of the image only the solids whose bounding rectangle
+overlaps it are intersected, nearest first.
+
+Intersection and shading are in one module, since numba's cache does not notice changes in the modules that are inlined.
 """
 
 import functools
-from typing import NamedTuple
 
 import numba
 import numpy as np
 
+from .scene import Scene
 from .textures import LEVELS, SIZE
 
 BOX, ELLIPSOID, CYLINDER = 0, 1, 2  # the cylinder's axis is its local y
 TILE = 8  # pixels
-NEAR = 1e-3  # scene units: hits closer than this are the surface that the ray starts from
-LAMP_PLACES = 6  # of a lamp that shadows are worked out for
-CORNER_REACH, CORNER_SHADE = 0.35, 0.35  # how far, and how much, the corners of the room are darkened
+NEAR = 1e-3  # metres; nearer hits are the surface from which the ray starts
+LAMP_SAMPLES = 6  # shadow rays to points along a lamp
+# Ambient occlusion in the corners of the enclosing solid: its range in metres, and its strength.
+CORNER_RANGE, CORNER_STRENGTH = 0.35, 0.35
 
-# NaN and infinity keep their meaning: a ray parallel to a face divides by zero. The loops allocate nothing, and without
-# numba's reference counting (`_nrt`), which else counts each array of the scene for each pixel, are 1.4 times as fast.
+# fastmath without `nnan` and `ninf`, since rays parallel to a face divide by zero. The loops allocate nothing: without
+# numba's reference counting (`_nrt`) of the scene's arrays at every pixel they are 1.4 times as fast.
 _compiled = functools.partial(
     numba.njit, cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"}, _nrt=False
 )
 _inlined = functools.partial(_compiled, forceinline=True)
-
-
-class Scene(NamedTuple):
-    """Solids, their materials and lights, in scene units; y points down. Solid 0 encloses all others and the cameras.
-
-    A material's texture coordinates are `uv @ (a, b, 1)` for the two local coordinates (a, b) of a face, in periods of
-    the texture; its colour is `colour @ (r, g, b, 1)` for a texel (r, g, b).
-    """
-
-    shapes: np.ndarray  # [solids] int64: BOX, ELLIPSOID or CYLINDER
-    centres: np.ndarray  # [solids, 3]
-    axes: np.ndarray  # [solids, 3, 3], rows: the local axes in the scene's frame
-    halves: np.ndarray  # [solids, 3], half extents along the local axes
-    materials: np.ndarray  # [solids, 6] int64, of the faces -x, +x, -y, +y, -z, +z
-    textures: np.ndarray  # [materials] int64, which texture of the bank
-    uv: np.ndarray  # [materials, 2, 3]
-    colours: np.ndarray  # [materials, 3, 4]
-    frequencies: np.ndarray  # [materials], periods of the texture per scene unit
-    glosses: np.ndarray  # [materials], strength of the highlight
-    glows: np.ndarray  # [materials], light that the surface gives off
-    light_positions: np.ndarray  # [lights, 3]
-    light_colours: np.ndarray  # [lights, 3]
-    light_reaches: np.ndarray  # [lights], distance at which half the light is left
-    light_lengths: np.ndarray  # [lights], half length of the lamp, a bar, which softens shadows; negative: casts none
-    ambient: np.ndarray  # [3]
 
 
 def cast_rays(
@@ -61,16 +39,16 @@ def cast_rays(
     image: np.ndarray,
     depth: np.ndarray,
 ) -> None:
-    """Fill `depth` [H, W] with the z-depth at pixel centres and `image` [H, W, 3] with colour, from 0, 1 for white.
+    """Fill `depth` [H, W] with the z-depth at pixel centres and `image` [H, W, 3] with color, in which 1 is white.
 
     texels: `Textures.texels`. camera_to_world: [4, 4], OpenCV axes. camera: focal lengths and
     centre in pixels, (fx, fy, cx, cy).
-    offsets: where inside a pixel to take colour, [samples, 2] in [0, 1); with none, `image` stays as it is.
+    offsets: the color samples' positions inside a pixel, [samples, 2] in [0, 1); with none, `image` is unchanged.
     """
     count = len(scene.shapes)
     origins, directions = np.empty((count, 3)), np.empty((count, 3, 3))
     nearest, outlines = np.empty(count), np.empty((count, 4))
-    _see_solids(scene, camera_to_world, camera, origins, directions, nearest, outlines)
+    _prepare_solids(scene, camera_to_world, camera, origins, directions, nearest, outlines)
     order, scratch = np.argsort(nearest), np.empty(count, np.int64)
     _cast(
         scene,
@@ -90,7 +68,7 @@ def cast_rays(
 
 
 @_compiled()
-def _see_solids(
+def _prepare_solids(
     scene: Scene,
     camera_to_world: np.ndarray,
     camera: tuple[float, float, float, float],
@@ -99,10 +77,11 @@ def _see_solids(
     nearest: np.ndarray,
     outlines: np.ndarray,
 ) -> None:
-    """Fill what the rays need to know of each solid.
+    """Fill the arrays that `_first_hit` reads.
 
     origins, directions: the camera's centre [solids, 3] and axes [solids, 3, 3] in the frames of the unit solids.
-    nearest: the smallest z-depth that it can have, [solids]. outlines: its box (x0, y0, x1, y1) in pixels, [solids, 4].
+    nearest: lower bound of a solid's z-depth, [solids]. outlines: its bounding rectangle in pixels, (x0, y0, x1, y1),
+    [solids, 4].
     """
     focal_x, focal_y, centre_x, centre_y = camera
     for solid in range(len(scene.shapes)):
@@ -131,7 +110,7 @@ def _see_solids(
             if z > NEAR:
                 u, v = focal_x * x / z + centre_x, focal_y * y / z + centre_y
                 x0, y0, x1, y1 = min(x0, u), min(y0, v), max(x1, u), max(y1, v)
-        if least <= NEAR and x0 < np.inf:  # partly behind the camera: may be anywhere
+        if least <= NEAR and x0 < np.inf:  # partly behind the camera: may cover any pixel
             x0, y0, x1, y1 = -np.inf, -np.inf, np.inf, np.inf
         nearest[solid] = least
         outlines[solid, 0], outlines[solid, 1], outlines[solid, 2], outlines[solid, 3] = x0, y0, x1, y1
@@ -153,9 +132,9 @@ def _cast(
     image: np.ndarray,
     depth: np.ndarray,
 ) -> None:
-    """`cast_rays`'s loop over tiles and pixels.
+    """The loop over tiles and pixels.
 
-    order: the solids by rising `nearest`. solids: room for those of a tile.
+    order: the solids by ascending `nearest`. solids: buffer for those of a tile, [solids].
     """
     height, width = depth.shape
     focal_x, focal_y, centre_x, centre_y = camera
@@ -175,14 +154,14 @@ def _cast(
                     depth[row, column] = z
                     if len(offsets) > 0:
                         pixel = (column - centre_x, row - centre_y, focal_x, focal_y)
-                        red, green, blue = _pixel_colour(
+                        red, green, blue = _pixel_color(
                             scene, texels, camera_to_world, origins, directions, nearest, solids, tried, offsets, pixel
                         )
                         image[row, column, 0], image[row, column, 1], image[row, column, 2] = red, green, blue
 
 
 @_inlined()
-def _pixel_colour(
+def _pixel_color(
     scene: Scene,
     texels: np.ndarray,
     camera_to_world: np.ndarray,
@@ -194,15 +173,15 @@ def _pixel_colour(
     offsets: np.ndarray,
     pixel: tuple[float, float, float, float],
 ) -> tuple[float, float, float]:
-    """The mean colour of a pixel's samples; `pixel`: its corner from the image's centre, and the focal lengths.
+    """The mean color of a pixel's samples. pixel: its corner relative to the principal point, and the focal lengths.
 
-    Every sample looks up the texture; light is worked out anew only where a sample meets another face than the last.
+    Every sample looks up the texture; light is computed once for consecutive samples on the same face.
     """
     samples = len(offsets)
     red, green, blue = 0.0, 0.0, 0.0
-    fine = np.log2(pixel[2] * np.sqrt(samples))  # the spread is that of a ray of width 1
+    fine = np.log2(pixel[2] * np.sqrt(samples))  # `spread` is for a ray of width 1
     lit_solid, lit_face = -1, -1
-    light_r, light_g, light_b, shine, spread, material = 0.0, 0.0, 0.0, 0.0, 0.0, 0
+    light_r, light_g, light_b, specular, spread, material = 0.0, 0.0, 0.0, 0.0, 0.0, 0
     for sample in range(samples):
         x, y = (pixel[0] + offsets[sample, 0]) / pixel[2], (pixel[1] + offsets[sample, 1]) / pixel[3]
         solid, z = _first_hit(scene.shapes, origins, directions, nearest, solids, tried, x, y)
@@ -218,11 +197,11 @@ def _pixel_colour(
         face, normal_x, normal_y, normal_z = _face(scene, solid, ux, uy, uz)
         if solid != lit_solid or face != lit_face:
             lit_solid, lit_face, material = solid, face, scene.materials[solid, face]
-            light_r, light_g, light_b, shine, spread = _light(
+            light_r, light_g, light_b, specular, spread = _light(
                 scene, camera_to_world, solid, face, (x, y, z), (ux, uy, uz), (normal_x, normal_y, normal_z)
             )
         r, g, b = _texel(scene, texels, solid, face, material, ux, uy, uz, spread - fine + (sample + 0.5) / samples)
-        red, green, blue = red + r * light_r + shine, green + g * light_g + shine, blue + b * light_b + shine
+        red, green, blue = red + r * light_r + specular, green + g * light_g + specular, blue + b * light_b + specular
     return red / samples, green / samples, blue / samples
 
 
@@ -237,9 +216,9 @@ def _first_hit(
     x: float,
     y: float,
 ) -> tuple[int, float]:
-    """Which of the first `tried` of `solids` the ray (x, y, 1) of the camera meets first, and at what z-depth.
+    """The first hit of the camera ray (x, y, 1) among the first `tried` of `solids`: the solid and its z-depth.
 
-    `solids` come by rising `nearest`.
+    solids: by ascending `nearest`.
     """
     best, best_z = 0, np.inf
     for index in range(tried):
@@ -257,7 +236,7 @@ def _first_hit(
 
 @_inlined()
 def _unit_hit(shape: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float) -> float:
-    """Where along o + t d the unit solid is met first, from outside or from inside; infinity where it is missed."""
+    """The first t > NEAR at which o + t d meets the surface of the unit solid; infinity if it does not."""
     if shape == ELLIPSOID:
         enter, leave = _quadratic(
             dx * dx + dy * dy + dz * dz, ox * dx + oy * dy + oz * dz, ox * ox + oy * oy + oz * oz - 1.0
@@ -278,7 +257,7 @@ def _unit_hit(shape: int, ox: float, oy: float, oz: float, dx: float, dy: float,
 
 @_inlined()
 def _slab(origin: float, direction: float) -> tuple[float, float]:
-    """The part of a line between the planes -1 and 1 of one axis."""
+    """The interval of a line between the planes at -1 and 1 of one axis."""
     inverse = 1.0 / direction
     a, b = (-1.0 - origin) * inverse, (1.0 - origin) * inverse
     return min(a, b), max(a, b)
@@ -286,7 +265,7 @@ def _slab(origin: float, direction: float) -> tuple[float, float]:
 
 @_inlined()
 def _quadratic(a: float, b: float, c: float) -> tuple[float, float]:
-    """The roots of a t^2 + 2 b t + c; an empty interval where there are none."""
+    """The roots of a t^2 + 2 b t + c; an empty interval if there are none."""
     discriminant = b * b - a * c
     if discriminant < 0.0:
         return np.inf, -np.inf
@@ -296,9 +275,9 @@ def _quadratic(a: float, b: float, c: float) -> tuple[float, float]:
 
 @_inlined()
 def _face(scene: Scene, solid: int, ux: float, uy: float, uz: float) -> tuple[int, float, float, float]:
-    """The face (see `Scene.materials`) of a surface point in the unit frame, and the normal's direction there.
+    """The face (see `Scene.materials`) of a surface point in the unit frame, and the normal there.
 
-    The normal is local and not of unit length.
+    The normal is in the local frame and not of unit length.
     """
     shape = scene.shapes[solid]
     nx, ny, nz = ux / scene.halves[solid, 0], uy / scene.halves[solid, 1], uz / scene.halves[solid, 2]
@@ -324,7 +303,7 @@ def _light(
     unit_point: tuple[float, float, float],
     normal: tuple[float, float, float],
 ) -> tuple[float, float, float, float, float]:
-    """The light that falls on a surface point, its highlight, and log2 of the texels that a ray of width 1 covers.
+    """Diffuse light (3 channels) and specular highlight of a surface point; log2 of texels per unit of ray width.
 
     ray: (x, y) and the z-depth at which it meets the point. unit_point: the point in the solid's unit frame.
     """
@@ -345,10 +324,10 @@ def _light(
 
     material = scene.materials[solid, face]
     spread = np.log2(SIZE * scene.frequencies[material] * z * length / np.sqrt(max(-slope, 0.02)))
-    dim = _corner_shade(scene, unit_point, face) if solid == 0 else 1.0
-    glow = scene.glows[material]
+    dim = _corner_occlusion(scene, unit_point, face) if solid == 0 else 1.0
+    emission = scene.emissions[material]
     light_r, light_g, light_b = scene.ambient[0], scene.ambient[1], scene.ambient[2]
-    shine = 0.0
+    specular = 0.0
     for light in range(len(scene.light_lengths)):
         vx = scene.light_positions[light, 0] - px
         vy = scene.light_positions[light, 1] - py
@@ -360,14 +339,14 @@ def _light(
         relative = distance / scene.light_reaches[light]
         strength = 1.0 / (1.0 + relative * relative)
         if scene.light_lengths[light] >= 0.0:
-            strength *= _visible_share(scene, light, px, py, pz, nx, ny, nz)
-        light_r += strength * cosine * scene.light_colours[light, 0]
-        light_g += strength * cosine * scene.light_colours[light, 1]
-        light_b += strength * cosine * scene.light_colours[light, 2]
-        if scene.glosses[material] > 0.0:  # the mirrored ray towards the light
+            strength *= _lamp_visibility(scene, light, px, py, pz, nx, ny, nz)
+        light_r += strength * cosine * scene.light_colors[light, 0]
+        light_g += strength * cosine * scene.light_colors[light, 1]
+        light_b += strength * cosine * scene.light_colors[light, 2]
+        if scene.speculars[material] > 0.0:  # Phong: the reflected ray towards the light
             mirrored = ((rx - 2 * slope * nx) * vx + (ry - 2 * slope * ny) * vy + (rz - 2 * slope * nz) * vz) / distance
-            shine += strength * scene.glosses[material] * max(mirrored, 0.0) ** 24
-    return glow + dim * light_r, glow + dim * light_g, glow + dim * light_b, shine, spread
+            specular += strength * scene.speculars[material] * max(mirrored, 0.0) ** 24
+    return emission + dim * light_r, emission + dim * light_g, emission + dim * light_b, specular, spread
 
 
 @_inlined()
@@ -382,7 +361,7 @@ def _texel(
     uz: float,
     detail: float,
 ) -> tuple[float, float, float]:
-    """The material's colour at a point of the unit frame, interpolated in the level next below `detail`."""
+    """The material's color at a point of the unit frame, bilinear in the mipmap level floor(detail)."""
     lx, ly, lz = ux * scene.halves[solid, 0], uy * scene.halves[solid, 1], uz * scene.halves[solid, 2]
     a, b = (lz, ly) if face < 2 else ((lx, lz) if face < 4 else (lx, ly))
     u = scene.uv[material, 0, 0] * a + scene.uv[material, 0, 1] * b + scene.uv[material, 0, 2]
@@ -421,46 +400,48 @@ def _texel(
     red, green, blue = red / 255, green / 255, blue / 255
     return (
         max(
-            scene.colours[material, 0, 0] * red
-            + scene.colours[material, 0, 1] * green
-            + scene.colours[material, 0, 2] * blue
-            + scene.colours[material, 0, 3],
+            scene.colors[material, 0, 0] * red
+            + scene.colors[material, 0, 1] * green
+            + scene.colors[material, 0, 2] * blue
+            + scene.colors[material, 0, 3],
             0.0,
         ),
         max(
-            scene.colours[material, 1, 0] * red
-            + scene.colours[material, 1, 1] * green
-            + scene.colours[material, 1, 2] * blue
-            + scene.colours[material, 1, 3],
+            scene.colors[material, 1, 0] * red
+            + scene.colors[material, 1, 1] * green
+            + scene.colors[material, 1, 2] * blue
+            + scene.colors[material, 1, 3],
             0.0,
         ),
         max(
-            scene.colours[material, 2, 0] * red
-            + scene.colours[material, 2, 1] * green
-            + scene.colours[material, 2, 2] * blue
-            + scene.colours[material, 2, 3],
+            scene.colors[material, 2, 0] * red
+            + scene.colors[material, 2, 1] * green
+            + scene.colors[material, 2, 2] * blue
+            + scene.colors[material, 2, 3],
             0.0,
         ),
     )
 
 
 @_inlined()
-def _corner_shade(scene: Scene, unit_point: tuple[float, float, float], face: int) -> float:
-    """How much light reaches a point of the enclosing solid: less where two of its faces meet."""
+def _corner_occlusion(scene: Scene, unit_point: tuple[float, float, float], face: int) -> float:
+    """Ambient occlusion factor of a point of the enclosing solid, lower near its edges."""
     gap_x = np.inf if face < 2 else scene.halves[0, 0] * (1 - abs(unit_point[0]))
     gap_y = np.inf if 2 <= face < 4 else scene.halves[0, 1] * (1 - abs(unit_point[1]))
     gap_z = np.inf if face >= 4 else scene.halves[0, 2] * (1 - abs(unit_point[2]))
-    return 1.0 - CORNER_SHADE * np.exp(-min(gap_x, gap_y, gap_z) / CORNER_REACH)
+    return 1.0 - CORNER_STRENGTH * np.exp(-min(gap_x, gap_y, gap_z) / CORNER_RANGE)
 
 
 @_inlined()
-def _visible_share(scene: Scene, light: int, px: float, py: float, pz: float, nx: float, ny: float, nz: float) -> float:
-    """The share of a lamp that a surface point sees; where the lamp's two ends agree, what lies between isn't tried."""
+def _lamp_visibility(
+    scene: Scene, light: int, px: float, py: float, pz: float, nx: float, ny: float, nz: float
+) -> float:
+    """The visible share of a lamp from a surface point; if both ends are visible or hidden, so is the rest."""
     ox, oy, oz = px + 2 * NEAR * nx, py + 2 * NEAR * ny, pz + 2 * NEAR * nz
     visible = 0.0
-    for turn in range(LAMP_PLACES):
-        place = turn - 1 if turn > 1 else turn * (LAMP_PLACES - 1)  # the ends first
-        shift = scene.light_lengths[light] * (2 * place / (LAMP_PLACES - 1) - 1)
+    for turn in range(LAMP_SAMPLES):
+        place = turn - 1 if turn > 1 else turn * (LAMP_SAMPLES - 1)  # the ends first
+        shift = scene.light_lengths[light] * (2 * place / (LAMP_SAMPLES - 1) - 1)
         dx = scene.light_positions[light, 0] + 0.7 * shift - ox
         dy = scene.light_positions[light, 1] - oy
         dz = scene.light_positions[light, 2] + 0.7 * shift - oz
@@ -468,15 +449,15 @@ def _visible_share(scene: Scene, light: int, px: float, py: float, pz: float, nx
             visible += 1.0
         if turn == 1 and visible != 1.0:
             return visible / 2
-    return visible / LAMP_PLACES
+    return visible / LAMP_SAMPLES
 
 
 @_inlined()
 def _blocked(scene: Scene, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float) -> bool:
-    """Whether a solid, other than the enclosing one and those that glow, stands between o and o + d."""
+    """Whether the segment from o to o + d meets a solid, except the enclosing one and emissive ones."""
     squared = dx * dx + dy * dy + dz * dz
     for solid in range(1, len(scene.shapes)):
-        # The ball around the solid, against the line.
+        # Bounding sphere against the line.
         wx, wy, wz = scene.centres[solid, 0] - ox, scene.centres[solid, 1] - oy, scene.centres[solid, 2] - oz
         along = (wx * dx + wy * dy + wz * dz) / squared
         off_x, off_y, off_z = wx - along * dx, wy - along * dy, wz - along * dz
@@ -493,12 +474,12 @@ def _blocked(scene: Scene, ox: float, oy: float, oz: float, dx: float, dy: float
             _along(scene.axes, solid, 1, dx, dy, dz) / half_y,
             _along(scene.axes, solid, 2, dx, dy, dz) / half_z,
         )
-        if t < 1.0 and scene.glows[scene.materials[solid, 0]] == 0.0:
+        if t < 1.0 and scene.emissions[scene.materials[solid, 0]] == 0.0:
             return True
     return False
 
 
 @_inlined()
 def _along(axes: np.ndarray, solid: int, axis: int, x: float, y: float, z: float) -> float:
-    """The component of a vector along one of a solid's axes."""
+    """The component of (x, y, z) along one of a solid's axes."""
     return axes[solid, axis, 0] * x + axes[solid, axis, 1] * y + axes[solid, axis, 2] * z

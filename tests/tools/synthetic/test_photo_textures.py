@@ -1,4 +1,4 @@
-"""Photographic textures, the scenes that only training has, and what reported scenes must not change by."""
+"""Textures from photographs, and the scene kinds of training; reported scenes have neither."""
 
 from pathlib import Path
 
@@ -6,10 +6,11 @@ import cv2
 import numpy as np
 import pytest
 from idesplat.runtime.errors import InputError
-from idesplat.tools.synthetic.layout import LAYOUTS, OUTDOOR_LAYOUTS, Builder
-from idesplat.tools.synthetic.photo_textures import KIND, photo_textures
+from idesplat.tools.synthetic.builder import SceneBuilder
+from idesplat.tools.synthetic.layout import LAYOUTS, OUTDOOR_LAYOUTS
+from idesplat.tools.synthetic.photo_textures import photo_textures
 from idesplat.tools.synthetic.sampler import TRAINING_SEEDS, VALIDATION_SEEDS
-from idesplat.tools.synthetic.textures import SIZE, texture_bank
+from idesplat.tools.synthetic.textures import PHOTO_KIND, SIZE, texture_bank
 from idesplat.tools.training.data.samples import SampleSpec
 from idesplat.tools.training.data.synthetic import generate_views
 
@@ -29,9 +30,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_windows_of_images_are_textures(folder: Path) -> None:
+def test_crops_of_images_are_textures(folder: Path) -> None:
     bank = photo_textures(folder)
-    assert bank.kinds == (KIND,) * 2
+    assert bank.kinds == (PHOTO_KIND,) * 2
     assert bank.texels.shape[1:] == texture_bank(1, 1).texels.shape[1:]
     finest = bank.texels[:, : SIZE * SIZE].reshape(2, SIZE, SIZE, 3)
     red = next(texture for texture in finest if texture[..., 2].max() == 0)
@@ -45,10 +46,10 @@ def test_folder_without_texture_is_refused(tmp_path: Path) -> None:
         photo_textures(tmp_path)
 
 
-def test_materials_have_them_where_they_are(folder: Path) -> None:
-    build = Builder(np.random.default_rng(1), photo_textures(folder))
-    with_plain = Builder(np.random.default_rng(1), texture_bank(1, 13))
-    assert build.photos == [0, 1] and with_plain.photos == []
+def test_materials_use_photos_if_there_are_any(folder: Path) -> None:
+    with_photos = SceneBuilder(np.random.default_rng(1), photo_textures(folder))
+    without_photos = SceneBuilder(np.random.default_rng(1), texture_bank(1, 13))
+    assert with_photos.photos == [0, 1] and without_photos.photos == []
 
 
 def test_training_scenes_change_and_reported_ones_do_not(folder: Path) -> None:
@@ -58,10 +59,12 @@ def test_training_scenes_change_and_reported_ones_do_not(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", range(len(OUTDOOR_LAYOUTS)))
-def test_kinds_of_training_alone_are_whole_scenes(kind: int) -> None:
+def test_training_scene_kinds_are_well_formed(kind: int) -> None:
     layout = OUTDOOR_LAYOUTS[kind](np.random.default_rng(kind), texture_bank(1, 13))
-    assert (layout.eyes[0] <= layout.eyes[1]).all() and (layout.focus[0] <= layout.focus[1]).all()
-    assert (layout.eyes[:, 1] < 0).all()  # above the ground; y points down
+    assert (layout.eye_bounds[0] <= layout.eye_bounds[1]).all() and (
+        layout.focus_bounds[0] <= layout.focus_bounds[1]
+    ).all()
+    assert (layout.eye_bounds[:, 1] < 0).all()  # above the ground; y points down
     assert len(layout.scene.shapes) == len(layout.scene.materials) > 3
     assert layout.scene.materials.max() < len(layout.scene.textures)
     assert OUTDOOR_LAYOUTS[kind] not in LAYOUTS

@@ -4,8 +4,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from idesplat.tools.synthetic.layout import furnished_room
-from idesplat.tools.synthetic.raycast import BOX, CYLINDER, ELLIPSOID, Scene
+from idesplat.tools.synthetic.indoor import furnished_room
+from idesplat.tools.synthetic.raycast import BOX, CYLINDER, ELLIPSOID
 from idesplat.tools.synthetic.sampler import (
     HELD_OUT_SEEDS,
     TRAINING_SEEDS,
@@ -16,6 +16,7 @@ from idesplat.tools.synthetic.sampler import (
     render,
     scene_textures,
 )
+from idesplat.tools.synthetic.scene import Scene
 from idesplat.tools.synthetic.textures import LEVELS, SIZE, Textures, texture_bank
 
 GREY = Textures(np.full((1, sum((SIZE >> level) ** 2 for level in range(LEVELS)), 3), 128, np.uint8), ("plain",))
@@ -33,12 +34,12 @@ def scene_of(*solids: tuple[int, tuple[float, ...], tuple[float, ...], np.ndarra
         materials=np.zeros((len(shapes), 6), np.int64),
         textures=np.zeros(1, np.int64),
         uv=np.eye(2, 3)[None],
-        colours=np.eye(3, 4)[None],
+        colors=np.eye(3, 4)[None],
         frequencies=np.ones(1),
-        glosses=np.zeros(1),
-        glows=np.zeros(1),
+        speculars=np.zeros(1),
+        emissions=np.zeros(1),
         light_positions=np.array([[0.0, -9.0, 0.0]]),
-        light_colours=np.full((1, 3), 0.5),
+        light_colors=np.full((1, 3), 0.5),
         light_reaches=np.array([1e9]),
         light_lengths=np.array([0.0]),
         ambient=np.full(3, 0.25),
@@ -158,15 +159,15 @@ def warped(sample: Sample, source: int, target: int) -> tuple[np.ndarray, np.nda
     projected = points @ sample.intrinsics[target].T
     places = projected[:, :2] / projected[:, 2:] * (width, height) - 0.5
     inside = ((places > 0) & (places < (width - 1.001, height - 1.001))).all(axis=1) & (points[:, 2] > 0)
-    colours = sample.images[source].reshape(3, -1).T
-    return places[inside], points[inside, 2], colours[inside], inside
+    colors = sample.images[source].reshape(3, -1).T
+    return places[inside], points[inside, 2], colors[inside], inside
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3, 4, 5, 6])
 def test_views_agree_where_depth_says_so(seed: int) -> None:
     """A pixel moved by its depth meets the other view's depth and colour, or is hidden there, but floats nowhere."""
     sample = generate_sample(seed, 1, 2, 96, 96)
-    places, z, colours, inside = warped(sample, 1, 2)
+    places, z, colors, inside = warped(sample, 1, 2)
     assert inside.mean() > 0.3
     column, row = places.astype(int).T
     corners = [(row + i, column + j) for i in (0, 1) for j in (0, 1)]
@@ -180,8 +181,8 @@ def test_views_agree_where_depth_says_so(seed: int) -> None:
     assert (z[smooth] < 0.99 * seen[smooth]).mean() < 0.005  # in front of what the other view sees
     assert met.sum() > 0.6 * smooth.sum()
     other = np.stack([sample.images[2][:, corner_row, corner_column] for corner_row, corner_column in corners])
-    difference = np.abs((weights[:, None] * other).sum(axis=0).T - colours)[met]
-    unrelated = np.abs(colours[met] - colours[met][::-1])
+    difference = np.abs((weights[:, None] * other).sum(axis=0).T - colors)[met]
+    unrelated = np.abs(colors[met] - colors[met][::-1])
     assert difference.mean() < 0.04
     assert difference.mean() < 0.4 * unrelated.mean()
 
@@ -191,7 +192,7 @@ def test_more_samples_come_closer_to_the_true_colour() -> None:
     bank = scene_textures(0)
     rng = np.random.default_rng(0)
     layout = furnished_room(rng, bank)
-    pose = look_at(layout.eyes.mean(axis=0), layout.focus[1])
+    pose = look_at(layout.eye_bounds.mean(axis=0), layout.focus_bounds[1])
     one, four, many = (render(layout.scene, bank, pose, WIDE_ANGLE, 64, 64, count)[0] for count in (1, 4, 64))
     error_of_one, error_of_four = (np.sqrt(np.mean((image - many) ** 2)) for image in (one, four))
     assert error_of_four < 0.75 * error_of_one

@@ -1,0 +1,94 @@
+"""Synthetic scenes inside a room."""
+
+import numpy as np
+
+from .builder import ANY_KINDS, FLOOR_KINDS, Layout, SceneBuilder, add_room, lamplit_scene, random_rotation
+from .objects import add_chair, add_crates, add_lamp, add_plant, add_small_object, add_table, furnish_wall
+from .raycast import BOX, CYLINDER, ELLIPSOID
+from .textures import Textures
+
+
+def furnished_room(rng: np.random.Generator, textures: Textures) -> Layout:
+    """A room with furniture along the walls and in the middle, and posters."""
+    builder = SceneBuilder(rng, textures)
+    width, height, length = add_room(builder)
+    for wall in range(4):
+        furnish_wall(builder, wall, width, height, length)
+    builder.position, builder.yaw = (rng.uniform(-0.2, 0.2) * width, 0.0, rng.uniform(-0.2, 0.2) * length), 0.0
+    if rng.random() < 0.7:
+        builder.box(
+            0, -0.005, 0, rng.uniform(0.8, 1.6), 0.005, rng.uniform(0.6, 1.2), builder.material("weave", "collage")
+        )
+    builder.yaw = rng.uniform(0, 2 * np.pi)
+    add_table(builder, rng.uniform(0.4, 0.78))
+    for _ in range(rng.integers(0, 4)):
+        builder.position = (rng.uniform(-0.3, 0.3) * width, 0.0, rng.uniform(-0.3, 0.3) * length)
+        builder.yaw = rng.uniform(0, 2 * np.pi)
+        (add_chair, add_plant, add_crates, add_lamp)[rng.integers(4)](builder)
+    builder.position, builder.yaw = (0.0, 0.0, 0.0), 0.0
+    eye_bounds = np.array(
+        [[-0.45 * width, -min(1.9, 0.8 * height), -0.45 * length], [0.45 * width, -0.8, 0.45 * length]]
+    )
+    focus_bounds = np.array([[-0.3 * width, -1.2, -0.3 * length], [0.3 * width, -0.4, 0.3 * length]])
+    return Layout(lamplit_scene(builder, width, height, length), eye_bounds, focus_bounds)
+
+
+def clutter(rng: np.random.Generator, textures: Textures) -> Layout:
+    """A room full of floating solids of random shape, size and rotation."""
+    builder = SceneBuilder(rng, textures)
+    width, height, length = add_room(builder, rng.uniform(0.8, 1.6))
+    for _ in range(rng.integers(8, 26)):
+        centre = tuple(rng.uniform(-0.5, 0.5, 3) * (width, height, length) - (0, height / 2, 0))
+        size = np.exp(rng.uniform(np.log(0.12), np.log(0.7)))
+        half = size * np.exp(rng.normal(0, 0.5, 3))
+        if rng.random() < 0.35:  # a card or a pole
+            half[rng.integers(3)] *= rng.choice([0.03, 5.0])
+        material = builder.material(*ANY_KINDS, period=size * rng.uniform(0.8, 4.0))
+        builder.add(
+            int(rng.choice([BOX, BOX, ELLIPSOID, CYLINDER])), centre, tuple(half), material, random_rotation(rng)
+        )
+    eye_bounds = np.array(
+        [[-0.48 * width, -0.9 * height, -0.48 * length], [0.48 * width, -0.1 * height, 0.48 * length]]
+    )
+    return Layout(
+        lamplit_scene(builder, width, height, length), eye_bounds, 0.6 * eye_bounds + 0.4 * eye_bounds.mean(axis=0)
+    )
+
+
+def table_top(rng: np.random.Generator, textures: Textures) -> Layout:
+    """Small objects on a table, seen from nearby."""
+    builder = SceneBuilder(rng, textures)
+    width, height, length = add_room(builder)
+    top = 0.75
+    board = builder.material(*FLOOR_KINDS, period=rng.uniform(0.4, 1.2))
+    builder.box(0, -top + 0.02, 0, rng.uniform(0.5, 1.2), 0.02, rng.uniform(0.4, 0.8), board)
+    builder.box(0, -top / 2 + 0.03, 0, 0.06, top / 2 - 0.03, 0.06, builder.material("wood", "plain"))
+    for _ in range(rng.integers(6, 16)):
+        builder.position = (rng.uniform(-0.5, 0.5), -top, rng.uniform(-0.4, 0.4))
+        builder.yaw = rng.uniform(0, 2 * np.pi)
+        add_small_object(builder, rng.uniform(0.04, 0.14))
+    builder.position, builder.yaw = (0.0, 0.0, 0.0), 0.0
+    eye_bounds = np.array([[-1.1, -top - 0.9, -1.1], [1.1, -top - 0.12, 1.1]])
+    focus_bounds = np.array([[-0.2, -top - 0.1, -0.2], [0.2, -top, 0.2]])
+    return Layout(lamplit_scene(builder, width, height, length), eye_bounds, focus_bounds)
+
+
+def cards(rng: np.random.Generator, textures: Textures) -> Layout:
+    """Flat cards and poles at many depths in front of a slanted wall: strong parallax and occlusion."""
+    builder = SceneBuilder(rng, textures)
+    width, height, length = add_room(builder, rng.uniform(1.0, 1.5))
+    wall = builder.material(*ANY_KINDS, period=rng.uniform(0.8, 3.0))
+    builder.yaw = rng.uniform(-0.5, 0.5)
+    builder.box(0, -height / 2, 0.35 * length, width, height, 0.02, wall)
+    builder.yaw = 0.0
+    for _ in range(rng.integers(6, 18)):
+        depth = rng.uniform(-0.3, 0.3) * length
+        centre = (rng.uniform(-0.4, 0.4) * width, -rng.uniform(0.05, 0.95) * height, depth)
+        size = rng.uniform(0.12, 0.6)
+        thin = rng.random() < 0.3
+        half = (0.03, rng.uniform(0.5, 1.5), 0.03) if thin else (size, size * rng.uniform(0.5, 1.6), 0.008)
+        tilt = random_rotation(rng, 0.4)
+        builder.add(BOX, centre, half, builder.material(*ANY_KINDS, period=2 * size * rng.uniform(0.5, 2)), tilt)
+    eye_bounds = np.array([[-0.3 * width, -0.8 * height, -0.48 * length], [0.3 * width, -0.2 * height, -0.35 * length]])
+    focus_bounds = np.array([[-0.1 * width, -0.7 * height, 0.2 * length], [0.1 * width, -0.3 * height, 0.3 * length]])
+    return Layout(lamplit_scene(builder, width, height, length), eye_bounds, focus_bounds)

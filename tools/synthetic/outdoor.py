@@ -1,0 +1,155 @@
+"""Synthetic scenes in the open, or seen from outside."""
+
+import numpy as np
+
+from .builder import (
+    ANY_KINDS,
+    FURNITURE_KINDS,
+    GROUND_KINDS,
+    WALL_KINDS,
+    Layout,
+    SceneBuilder,
+    add_open_ground,
+    add_room,
+    lamplit_scene,
+    random_rotation,
+    sunlit_scene,
+)
+from .objects import add_chair, add_crates, add_fence, add_plant, add_sign, add_tree
+from .raycast import BOX, CYLINDER, ELLIPSOID
+from .textures import Textures
+
+
+def street(rng: np.random.Generator, textures: Textures) -> Layout:
+    """Open ground with buildings, trees, signs and boxes."""
+    builder = SceneBuilder(rng, textures)
+    reach = add_open_ground(builder, *GROUND_KINDS)
+    for _ in range(rng.integers(2, 7)):
+        half_x, half_y, half_z = rng.uniform(1, 4), rng.uniform(1.2, 6), rng.uniform(1, 4)
+        bearing, distance = rng.uniform(0, 2 * np.pi), rng.uniform(6, 0.8 * reach)
+        builder.position, builder.yaw = (distance * np.cos(bearing), 0, distance * np.sin(bearing)), rng.uniform(0, 7)
+        wall = builder.material("brick", "checker", "plain", "wood", "cells", "stripes", period=rng.uniform(1, 4))
+        builder.box(0, -half_y, 0, half_x, half_y, half_z, wall)
+        pane = builder.material("plain", "gradient", "collage")
+        for storey in range(int(half_y)):
+            builder.box(rng.uniform(-0.3, 0.3) * half_x, -2 * storey - 1.4, 0, 0.4 * half_x, 0.5, half_z + 0.03, pane)
+    for _ in range(rng.integers(5, 14)):
+        bearing, distance = rng.uniform(0, 2 * np.pi), 1 + rng.uniform(0, 9)
+        builder.position, builder.yaw = (distance * np.cos(bearing), 0, distance * np.sin(bearing)), rng.uniform(0, 7)
+        (add_tree, add_sign, add_crates, add_crates, add_fence)[rng.integers(5)](builder)
+    builder.position, builder.yaw = (0.0, 0.0, 0.0), 0.0
+    eye_bounds = np.array([[-8, -2.5, -8], [8, -1.0, 8]])
+    return Layout(sunlit_scene(builder), eye_bounds, np.array([[-4, -2.0, -4], [4, -0.3, 4]]))
+
+
+def facade(rng: np.random.Generator, textures: Textures) -> Layout:
+    """The front of a building with recessed windows, ledges and columns, and objects in front of it."""
+    builder = SceneBuilder(rng, textures)
+    add_open_ground(builder, *GROUND_KINDS)
+    wall = builder.material("brick", "cells", "plain", "noise", "wood", period=rng.uniform(0.8, 3.0))
+    trim, pane = builder.material("plain", "noise", "speckle"), builder.material("plain", "gradient", "collage")
+    half_x, height, depth = rng.uniform(4, 9), rng.uniform(3, 9), rng.uniform(0.05, 0.4)
+    builder.box(0, -height / 2, 1.0, half_x, height / 2, 1.0, pane)
+    columns, storeys = int(rng.integers(3, 8)), max(1, round(height / rng.uniform(2.2, 3.2)))
+    pitch, storey = 2 * half_x / columns, height / storeys
+    pier, band = rng.uniform(0.15, 0.35) * pitch, rng.uniform(0.15, 0.3) * storey
+    for column in range(columns + 1):
+        builder.box(-half_x + column * pitch, -height / 2, -depth / 2, pier, height / 2, depth / 2, wall)
+    for level in range(storeys + 1):
+        builder.box(0, -level * storey, -depth / 2, half_x, band, depth / 2 + 0.03, wall)
+        builder.box(0, -level * storey - band, -depth / 2, half_x, 0.06, depth / 2 + rng.uniform(0.03, 0.2), trim)
+    for _ in range(rng.integers(2, 9)):
+        builder.position, builder.yaw = (
+            (rng.uniform(-0.9, 0.9) * half_x, 0.0, -rng.uniform(0.6, 4.0)),
+            rng.uniform(0, 7),
+        )
+        (add_plant, add_sign, add_crates, add_fence, add_tree)[rng.integers(5)](builder)
+    builder.position, builder.yaw = (0.0, 0.0, 0.0), 0.0
+    eye_bounds = np.array([[-0.6 * half_x, -2.2, -9.0], [0.6 * half_x, -1.2, -3.5]])
+    focus_bounds = np.array([[-0.5 * half_x, -0.6 * height, 0.0], [0.5 * half_x, -0.8, 0.0]])
+    return Layout(sunlit_scene(builder), eye_bounds, focus_bounds)
+
+
+def around_object(rng: np.random.Generator, textures: Textures) -> Layout:
+    """One object of intersecting solids, on the ground or on a stand, seen from nearby."""
+    builder = SceneBuilder(rng, textures)
+    outside = rng.random() < 0.5
+    size = add_room(builder) if not outside else None
+    if outside:
+        add_open_ground(builder, *GROUND_KINDS)
+    top = rng.choice([0.0, rng.uniform(0.3, 0.9)])
+    if top:
+        stand = builder.material(*FURNITURE_KINDS)
+        builder.add(CYLINDER, (0, -top / 2, 0), (rng.uniform(0.25, 0.6), top / 2, rng.uniform(0.25, 0.6)), stand)
+    scale = rng.uniform(0.12, 0.4)
+    materials = [builder.material(*ANY_KINDS, period=scale * rng.uniform(0.5, 3.0)) for _ in range(rng.integers(1, 5))]
+    for _ in range(rng.integers(5, 24)):
+        half = scale * np.exp(rng.normal(-0.9, 0.5, 3))
+        centre = tuple(rng.normal(0, 0.5, 3) * scale - (0, top + scale, 0))
+        shape = int(rng.choice([BOX, ELLIPSOID, ELLIPSOID, CYLINDER]))
+        builder.add(shape, centre, tuple(half), materials[rng.integers(len(materials))], random_rotation(rng))
+    for _ in range(rng.integers(0, 5)):
+        bearing, distance = rng.uniform(0, 2 * np.pi), rng.uniform(1.2, 2.5)
+        builder.position, builder.yaw = (distance * np.cos(bearing), 0, distance * np.sin(bearing)), rng.uniform(0, 7)
+        (add_plant, add_crates, add_chair)[rng.integers(3)](builder)
+    builder.position, builder.yaw = (0.0, 0.0, 0.0), 0.0
+    bearing, distance = rng.uniform(0, 2 * np.pi), scale * rng.uniform(2.5, 5.0)
+    eye = np.array([distance * np.cos(bearing), -top - scale * rng.uniform(0.5, 3.0), distance * np.sin(bearing)])
+    focus = np.array([0.0, -top - scale, 0.0])
+    spread = 0.3 * scale
+    scene = sunlit_scene(builder) if size is None else lamplit_scene(builder, *size)
+    return Layout(scene, np.stack([eye - spread, eye + spread]), np.stack([focus - spread, focus + spread]))
+
+
+def from_above(rng: np.random.Generator, textures: Textures) -> Layout:
+    """Houses, trees and roads, seen from above."""
+    builder = SceneBuilder(rng, textures)
+    add_open_ground(builder, *GROUND_KINDS)
+    for _ in range(rng.integers(1, 4)):
+        builder.yaw = rng.uniform(0, np.pi)
+        road = builder.material("plain", "noise", "speckle", period=3.0)
+        builder.box(rng.uniform(-6, 6), -0.01, 0, rng.uniform(0.8, 2.0), 0.02, 17, road)
+    for _ in range(rng.integers(6, 22)):
+        builder.position, builder.yaw = (rng.uniform(-12, 12), 0.0, rng.uniform(-12, 12)), rng.uniform(0, 7)
+        half_x, half_y, half_z = rng.uniform(0.8, 2.5), rng.uniform(0.6, 2.5), rng.uniform(0.8, 2.5)
+        wall, roof = (
+            builder.material(*WALL_KINDS, period=2.0),
+            builder.material("brick", "stripes", "cells", period=1.5),
+        )
+        builder.box(0, -half_y, 0, half_x, half_y, half_z, wall)
+        slope = rng.uniform(0.2, 0.7)
+        cos, sin = np.cos(slope), np.sin(slope)
+        for side in (-1, 1):
+            axes = np.array([[cos, side * sin, 0], [-side * sin, cos, 0], [0, 0, 1.0]])
+            centre = (side * 0.5 * half_x, -2 * half_y - 0.5 * half_x * np.tan(slope), 0)
+            builder.add(BOX, centre, (0.55 * half_x / cos, 0.04, 1.1 * half_z), roof, axes)
+    for _ in range(rng.integers(4, 16)):
+        builder.position, builder.yaw = (rng.uniform(-12, 12), 0.0, rng.uniform(-12, 12)), 0.0
+        add_tree(builder)
+    builder.position, builder.yaw = (0.0, 0.0, 0.0), 0.0
+    eye_bounds = np.array([[-10, -14.0, -10], [10, -7.0, 10]])
+    return Layout(sunlit_scene(builder), eye_bounds, np.array([[-4, -1.0, -4], [4, 0.0, 4]]))
+
+
+def foliage(rng: np.random.Generator, textures: Textures) -> Layout:
+    """Bushes of many thin leaves at many depths, in front of a wall or open ground."""
+    builder = SceneBuilder(rng, textures)
+    add_open_ground(builder, "strokes", "noise", "cells")
+    if rng.random() < 0.5:
+        builder.box(0, -1.5, 2.5, 5, 1.5, 0.1, builder.material(*WALL_KINDS, period=2.0))
+    for _ in range(rng.integers(2, 5)):
+        leaf = builder.material("strokes", "noise", "gradient", period=rng.uniform(0.1, 0.4))
+        wood = builder.material("wood", "noise", period=0.3)
+        position, radius = (rng.uniform(-1.5, 1.5), 0.0, rng.uniform(-0.5, 2.0)), rng.uniform(0.3, 0.7)
+        builder.position, length = position, rng.uniform(0.05, 0.16)
+        for _ in range(rng.integers(2, 6)):
+            half = rng.uniform(0.4, 0.8) * radius
+            tilt = random_rotation(rng, 0.6)
+            builder.add(CYLINDER, (rng.normal(0, 0.1), -half, rng.normal(0, 0.1)), (0.015, half, 0.015), wood, tilt)
+        for _ in range(rng.integers(15, 40)):
+            centre = tuple(rng.normal(0, 0.5, 3) * radius - (0, radius, 0))
+            blade = length * rng.uniform(0.3, 0.6), length, 0.04 * length
+            builder.add(ELLIPSOID, centre, blade, leaf, random_rotation(rng))
+    builder.position = (0.0, 0.0, 0.0)
+    eye_bounds = np.array([[-1.5, -1.7, -3.5], [1.5, -0.5, -1.8]])
+    return Layout(sunlit_scene(builder), eye_bounds, np.array([[-0.8, -0.9, 0.0], [0.8, -0.3, 1.0]]))
