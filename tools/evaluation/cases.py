@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...runtime.geometry.consistency import project_to_view
+from ...runtime.geometry.intrinsics import denormalize_intrinsics
 from ...runtime.splats.points import unproject
 
 # Relative difference of depths of the same surface.
@@ -38,7 +39,7 @@ class PosedImages:
     def K(self, view: int) -> np.ndarray:
         """One view's intrinsics in pixels, pixel centres at .5, [3, 3], float64."""
         height, width = self.images.shape[2:]
-        return np.diag([width, height, 1.0]) @ self.intrinsics[view]
+        return denormalize_intrinsics(self.intrinsics[view], width, height)
 
 
 @dataclass(frozen=True, eq=False)

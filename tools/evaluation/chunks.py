@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from ...runtime.errors import InputError, error_context
-from ...runtime.geometry.intrinsics import check_intrinsics
+from ...runtime.geometry.intrinsics import check_intrinsics, denormalize_intrinsics, intrinsic_matrix
 from ...runtime.geometry.rigid import invert_rigid
 from ...runtime.images.resizing import cover_crop, resize_and_crop
 from ...runtime.system.files import check_regular, read_bytes
@@ -177,7 +177,7 @@ def _posed(scene: dict[str, Any], frames: list[int], height: int, width: int) ->
 def _camera(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Normalised intrinsics [3, 3] and camera-to-world pose [4, 4] of a row of `cameras` [18]."""
     fx, fy, cx, cy = numbers[:4]
-    intrinsics = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    intrinsics = intrinsic_matrix(fx, fy, cx, cy)
     check_intrinsics(intrinsics, 1, 1)
     world_to_camera = np.vstack([numbers[FIRST_POSE_NUMBER:].reshape(3, 4), [0, 0, 0, 1]])
     return intrinsics, invert_rigid(world_to_camera)
@@ -205,4 +205,4 @@ def _fitted(image: np.ndarray, K: np.ndarray, height: int, width: int) -> tuple[
     full_height, full_width = image.shape[:2]
     crop = cover_crop(full_width, full_height, width, height)
     scaled = Image.fromarray(image).resize((crop.width, crop.height), Image.Resampling.LANCZOS)
-    return resize_and_crop(np.asarray(scaled), np.diag([crop.width, crop.height, 1.0]) @ K, height, width)
+    return resize_and_crop(np.asarray(scaled), denormalize_intrinsics(K, crop.width, crop.height), height, width)

@@ -19,6 +19,7 @@ from ...runtime.errors import exit_on_input_error
 from ...runtime.inference.bundled_model import bundled_model
 from ...runtime.inference.model_files import read_model
 from ...runtime.inference.session import open_session, run_session
+from ...runtime.system.progress import progress
 from ..evaluation.cases import synthetic_case
 from ..synthetic.sampler import HELD_OUT_SEEDS
 
@@ -49,11 +50,9 @@ def main(
     exact = _depths(graph, feeds)
     table = Table("part", "all matmuls", "matmuls with weights", title="median relative change of depth, largest")
     parts = dict.fromkeys(node.name.split("/")[1] for node in graph.graph.node if node.op_type in MATMULS)
-    with Console(stderr=True).status("rounding") as status:
-        for part in parts:
-            status.update(f"rounding {part}")
-            found = [_depths(_rounded(graph, part, weighted), feeds) for weighted in (False, True)]
-            table.add_row(part, *(f"{_change(depths, exact):.0e}" for depths in found))
+    for part in progress(parts, "rounding"):
+        found = [_depths(_rounded(graph, part, weighted), feeds) for weighted in (False, True)]
+        table.add_row(part, *(f"{_change(depths, exact):.0e}" for depths in found))
     Console().print(table)
 
 

@@ -13,6 +13,7 @@ import typer
 
 from ...runtime.cli.terminal import run, say
 from ...runtime.errors import exit_on_input_error
+from ...runtime.geometry.intrinsics import intrinsic_matrix
 from ...runtime.rendering.render import render_view
 from ...runtime.splats.gaussians import Gaussians
 from ...runtime.splats.io import FORMATS, read_splats, write_splats
@@ -70,7 +71,7 @@ def _render(scene: Gaussians) -> np.ndarray:
     """Render the scene from between the views."""
     extrinsics = np.eye(4)
     extrinsics[0, 3] = 0.1
-    K = np.array([[SIDE, 0, SIDE / 2], [0, SIDE, SIDE / 2], [0, 0, 1.0]])
+    K = intrinsic_matrix(SIDE, SIDE, SIDE / 2, SIDE / 2)
     return render_view(scene, extrinsics, K, SIDE, SIDE).rgb
 
 

@@ -12,6 +12,7 @@ import typer
 from ...runtime.cameras.io import read_cameras
 from ...runtime.cli.terminal import run, say
 from ...runtime.errors import exit_on_input_error
+from ...runtime.geometry.intrinsics import denormalize_intrinsics
 from ...runtime.images.colormaps import colormap_depth
 from ...runtime.images.png import save_png
 from ...runtime.inference.bundled_model import bundled_model
@@ -35,8 +36,8 @@ def image(
     given = build_view_batch(pairs[: len(CONTEXT)], None, height, width)
     found = predictor.predict_views(given)
     views = build_view_batch(pairs, None, height, width)
-    pixels = views.intrinsics[-1].astype(np.float64) * np.array([width, height, 1.0])[:, None]
-    rendered = render_view(found.need_gaussians(), views.extrinsics[-1], pixels, width, height).rgb
+    K = denormalize_intrinsics(views.intrinsics[-1], width, height)
+    rendered = render_view(found.need_gaussians(), views.extrinsics[-1], K, width, height).rgb
     first, second, truth = views.images.transpose(0, 2, 3, 1)
     save_png(out, np.hstack([first, colormap_depth(found.depth[0]), rendered, truth, second]).astype(np.float32))
     say(f"wrote {out}")

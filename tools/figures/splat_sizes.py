@@ -12,7 +12,6 @@ from typing import Annotated
 import numpy as np
 import typer
 from rich.console import Console
-from rich.progress import track
 from rich.table import Table
 
 from ...runtime.cli.terminal import run
@@ -20,6 +19,7 @@ from ...runtime.errors import exit_on_input_error
 from ...runtime.inference.bundled_model import bundled_model
 from ...runtime.inference.predictor import Predictor
 from ...runtime.splats.gaussians import Gaussians
+from ...runtime.system.progress import progress
 from ..evaluation.baselines import SPLAT_PIXELS, oracle_depth_splats
 from ..evaluation.cases import EvalCase, synthetic_case
 from ..evaluation.metrics import psnr
@@ -40,9 +40,8 @@ def main(
     """Compare oracle-depth splats of several sizes and the model's splats on held-out scenes."""
     predictor = Predictor(model or bundled_model())
     table = Table("zoom", *(f"{size:g} pixels" for size in SIZES), OWN, title="PSNR, dB, co-visible pixels")
-    console = Console(stderr=True)
     for zoom in ZOOMS:
-        seeds = track(HELD_OUT_SEEDS[:scenes], f"{zoom} times zoomed", console=console, transient=True)
+        seeds = progress(HELD_OUT_SEEDS[:scenes], f"zoom {zoom}")
         rows = [row for seed in seeds for row in _measured(predictor, seed, zoom)]
         table.add_row(str(zoom), *(f"{value:.2f}" for value in np.mean(rows, axis=0)))
     Console().print(table)
