@@ -73,8 +73,8 @@ def run_command(main, *arguments) -> int:
     return 0
 
 
-# Fixtures that export a network, which takes half a minute.
-EXPORTS = {"exported", "kept_traces"}
+# Fixtures that export a network, train one, or make the weights of a released one.
+SLOW_FIXTURES = {"exported", "kept_traces", "finished", "released"}
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -87,7 +87,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         fixtures = set(getattr(item, "fixturenames", ()))
         if "browser" in fixtures:
             item.add_marker("browser")
-        if fixtures & EXPORTS or item.get_closest_marker("parity"):
+        if fixtures & SLOW_FIXTURES or item.get_closest_marker("parity"):
             item.add_marker("slow")
         if os.name == "nt" and item.get_closest_marker("posix"):
             item.add_marker(pytest.mark.skip(reason="needs POSIX"))

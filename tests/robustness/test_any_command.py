@@ -238,6 +238,7 @@ def assert_shown(text: str) -> None:
     assert "Traceback" not in text
 
 
+@pytest.mark.slow
 @pytest.mark.posix
 @pytest.mark.parametrize("name", COMMANDS)
 def test_any_call_succeeds_or_changes_nothing(

@@ -73,6 +73,7 @@ def test_no_code_of_a_folder_of_cameras_runs(tmp_path):
     assert not sprung.exists()
 
 
+@pytest.mark.slow
 def test_no_code_of_the_current_folder_runs_in_benchmarks(tmp_path):
     sprung = set_traps(tmp_path)
     code = (
@@ -102,6 +103,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_no_code_of_the_current_folder_runs_in_training(tmp_path):
     """Two processes; the second one is started by multiprocessing."""
     sprung = set_traps(tmp_path)
@@ -112,6 +114,7 @@ def test_no_code_of_the_current_folder_runs_in_training(tmp_path):
     assert not sprung.exists()
 
 
+@pytest.mark.slow
 def test_no_code_of_the_current_folder_runs_in_benchmarks_of_training(tmp_path, monkeypatch):
     from idesplat.tools.benchmark import training as bench_training
 

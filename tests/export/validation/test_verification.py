@@ -181,7 +181,8 @@ def intrinsics_of_another_view(path):
     s.replace_input("intrinsics", lambda k: s.add("Expand", s.part(k, 0, 0, 1), s.add("Shape", k)))
 
 
-# The stage that a staged export has the fault in, and the tensor that shows it there.
+# The stage that a staged export has the fault in, and the tensor that shows it there. The last case, upright and with
+# cameras of each view's own, shows all of them.
 FAULTS = {
     one_view: ("gaussians", "depth"),
     one_channel: ("gaussians", "quats"),
@@ -198,7 +199,9 @@ def test_a_fault_in_a_fused_export_is_caught(exported, cases, fault, tmp_path):
     path = shutil.copy(exported[0], tmp_path / "model.onnx")
     fault(path)
     stage, tensor = FAULTS[fault]
-    failed = [error for error in compare(Exported([], staged=False, fused=path), cases, TOLERANCE) if not error.passed]
+    failed = [
+        error for error in compare(Exported([], staged=False, fused=path), cases[-1:], TOLERANCE) if not error.passed
+    ]
     assert {error.stage for error in failed} == {FUSED}
     assert (tensor if stage == "gaussians" else "depth") in {error.tensor for error in failed}
 
@@ -208,7 +211,7 @@ def test_a_fault_in_a_staged_export_is_caught_in_its_stage_and_end_to_end(export
     stage, tensor = FAULTS[fault]
     folder = shutil.copytree(exported[1], tmp_path / "staged")
     fault(folder / f"{stage}.onnx")
-    failed = [error for error in compare(Exported(stages_of(folder)), cases, TOLERANCE) if not error.passed]
+    failed = [error for error in compare(Exported(stages_of(folder)), cases[-1:], TOLERANCE) if not error.passed]
     assert {error.stage for error in failed} == {stage, STAGED}
     assert tensor in {error.tensor for error in failed}
 

@@ -128,6 +128,7 @@ def test_mutated_numbers_of_llff(tmp_path, pictures, data):
 # ---- COLMAP's library is in a process of its own, which takes half a second
 
 
+@pytest.mark.slow
 @settings(quick, max_examples=12)
 @given(data=st.data())
 @pytest.mark.parametrize("kind", ["binary", "text"])

@@ -327,6 +327,7 @@ def assert_cameras_or_input_error(path):
         assert camera.width > 0 and camera.height > 0 and camera.K[0, 0] > 0
 
 
+@pytest.mark.slow
 @fuzz
 @given(data=st.data())
 def test_mutated_values(tmp_path, cameras, data):
@@ -353,6 +354,7 @@ def test_mutated_bytes(tmp_path, cameras, data):
     assert_cameras_or_input_error(tmp_path / "c.json")
 
 
+@pytest.mark.slow
 @fuzz
 @given(document=st.dictionaries(st.sampled_from(FIELDS), values))
 def test_random_documents(tmp_path, document):

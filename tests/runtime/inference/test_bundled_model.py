@@ -33,6 +33,7 @@ def test_damaged_or_missing_is_refused(tmp_path, monkeypatch):
         module.bundled_model()
 
 
+@pytest.mark.slow
 def test_finds_depth_far_better_than_one_plane_does(scene):
     """The photographs of a drawn room: its errors are less than half of those of the best constant depth."""
     cameras = read_cameras(scene / "transforms.json")

@@ -48,6 +48,7 @@ def test_two_photographs(room):
     assert near < np.percentile(depth, 2) * scale and far > np.percentile(depth, 98) * scale
 
 
+@pytest.mark.slow
 def test_three_photographs_through_the_mapper(room):
     pictures, known = room
     for focal in (str(known[0].K[0, 0]), None):
@@ -97,6 +98,7 @@ def save(path, rgb):
     return path
 
 
+@pytest.mark.slow
 def test_refusals(room, tmp_path, monkeypatch):
     (first, second, _), (camera, *_) = room
     focal = str(camera.K[0, 0])

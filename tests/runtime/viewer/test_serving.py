@@ -191,6 +191,7 @@ def test_a_server_that_cannot_be_guarded_is_not_used():
         pass
 
 
+@pytest.mark.slow
 @pytest.mark.posix
 @pytest.mark.parametrize("number, status", [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
 def test_signals_end_it(served, number, status):

@@ -198,6 +198,7 @@ def test_large_captures_give_nearly_the_best_pair(name, monkeypatch):
     assert len(set(select_views(cameras, 6))) == 6
 
 
+@pytest.mark.slow
 def test_ten_thousand_cameras_take_little_memory():
     code = """
 import resource, sys

@@ -98,6 +98,7 @@ def test_the_nearest_view_fills_what_none_sees() -> None:
     np.testing.assert_array_equal(warp_plane(context, STRAIGHT, context.K(0), 1 / DEPTH), context.image(1))
 
 
+@pytest.mark.slow
 def test_no_plane_of_a_dense_sweep_is_better(scene) -> None:
     """On a furnished room, where no plane fits."""
     frames = match_images_to_cameras(find_images([scene / "images"]), read_cameras(scene / "transforms.json"))

@@ -64,6 +64,7 @@ def test_same_seed_same_files_other_seed_others(scene: Path, tmp_path: Path) -> 
         assert (tmp_path / "other" / name).read_bytes() != (scene / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_command_names_what_it_wrote_and_refuses_in_one_line(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "idesplat.tools.synthetic.make_scene"]
     small = ["--views", "2", "--height", "32", "--width", "48"]

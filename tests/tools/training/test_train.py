@@ -289,6 +289,7 @@ def test_stopped_while_writing_keeps_the_checkpoint_before(
     assert state.step == SETTINGS.steps
 
 
+@pytest.mark.slow
 def test_killed_process_leaves_a_checkpoint_to_go_on_from(tmp_path: Path) -> None:
     """SIGKILL, wherever it hits, in a run that writes its checkpoint at every step."""
     options = {"steps": 500, "size": 64, "batch": 1, "save-every": 0}
