@@ -19,7 +19,7 @@ from idesplat.model.registry import PRESETS, build
 from idesplat.runtime.cli.infer import main as infer
 from idesplat.runtime.inference.metadata import INPUTS, read_manifest
 from idesplat.runtime.inference.predictor import Predictor
-from reference_weights import draw_tensor
+from reference_weights import random_tensor
 
 SIZE = {"height": 64, "width": 96}
 # With many candidates the graph scores all pixels; with few, those around each candidate.
@@ -39,7 +39,7 @@ STAGES = {
 def network(name):
     """A tiny network with weights that matter: drawn as for the references."""
     model = build(NETWORKS[name]).eval()
-    drawn = {key: draw_tensor(key, tuple(value.shape), seed=1, gain=1.0) for key, value in model.state_dict().items()}
+    drawn = {key: random_tensor(key, tuple(value.shape), seed=1, gain=1.0) for key, value in model.state_dict().items()}
     model.load_state_dict({key: torch.from_numpy(np.array(value, np.float32)) for key, value in drawn.items()})
     return model
 

@@ -20,7 +20,7 @@ from idesplat.model.checkpoint import (
 )
 from idesplat.model.idesplat.keys import RENAMING, rename_released
 from idesplat.model.registry import PRESETS
-from reference_weights import draw_state_dict
+from reference_weights import random_state_dict
 from safetensors.torch import save_file
 
 CASE = "idesplat-re10k-2v-256x256"
@@ -29,7 +29,7 @@ CASE = "idesplat-re10k-2v-256x256"
 @pytest.fixture(scope="module")
 def released():
     """Tensors of a released checkpoint's keys and shapes, all on the meta device but for their shape."""
-    return {key: value.to("meta") for key, value in draw_state_dict(CASE).items()}
+    return {key: value.to("meta") for key, value in random_state_dict(CASE).items()}
 
 
 @pytest.mark.parametrize("nest", (lambda d: d, lambda d: {"state_dict": d, "epoch": 3}, lambda d: {"model": d}))

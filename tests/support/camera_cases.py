@@ -18,6 +18,7 @@ POINTS = np.array([[x, y, 4.0 + 0.5 * x - y] for x in (-1.0, -0.4, 0.2, 0.6, 0.9
 
 
 def pose(angles, position):
+    """Camera-to-world [4, 4] from a rotation vector in radians and a position."""
     matrix = np.eye(4)
     matrix[:3, :3] = cv2.Rodrigues(np.array(angles, dtype=float))[0]
     matrix[:3, 3] = position
@@ -38,6 +39,7 @@ def inverse(camera):
 
 
 def assert_same(read, expected):
+    """The same cameras in the same order, numbers within TOLERANCE."""
     assert [camera.name for camera in read] == [camera.name for camera in expected]
     for ours, theirs in zip(read, expected, strict=True):
         assert (ours.width, ours.height, ours.fisheye) == (theirs.width, theirs.height, theirs.fisheye)
@@ -46,7 +48,8 @@ def assert_same(read, expected):
         np.testing.assert_allclose(ours.extrinsics, theirs.extrinsics, rtol=0, atol=TOLERANCE)
 
 
-def save_pictures(folder, names, width=WIDTH, height=HEIGHT):
+def save_images(folder, names, width=WIDTH, height=HEIGHT):
+    """Write black images of these names into a folder; its files in order."""
     folder.mkdir(exist_ok=True)
     for name in names:
         assert cv2.imwrite(str(folder / name), np.zeros((height, width, 3), np.uint8))
@@ -71,6 +74,7 @@ def colmap_model(cameras, model="PINHOLE", parameters=(510.25, 498.75, 301.5, 25
 
 
 def as_re10k(cameras):
+    """The text of a RealEstate10K camera file."""
     lines = ["https://www.youtube.com/watch?v=0123456789a"]
     for camera in cameras:
         values = [K[0, 0] / WIDTH, K[1, 1] / HEIGHT, K[0, 2] / WIDTH, K[1, 2] / HEIGHT, 0, 0, *inverse(camera)[:3].flat]
@@ -79,6 +83,7 @@ def as_re10k(cameras):
 
 
 def as_llff(cameras, bounds=(1.5, 20.0)):
+    """The rows of LLFF's poses_bounds.npy, [cameras, 17]."""
     rows = []
     for camera in cameras:
         right, down, forward, position = camera.extrinsics[:3].T
@@ -91,6 +96,7 @@ CENTRED = np.array([[510.25, 0, WIDTH / 2], [0, 510.25, HEIGHT / 2], [0, 0, 1]])
 
 
 def as_cam_txt(camera, matrix, depths):
+    """The text of a *_cam.txt of DTU or MVSNet; `depths` is its last line."""
     rows = ["extrinsic", *(" ".join(map(repr, row)) for row in inverse(camera).tolist()), "", "intrinsic"]
     return "\n".join([*rows, *(" ".join(map(repr, row)) for row in matrix.tolist()), "", depths, ""])
 
@@ -105,6 +111,7 @@ STEREO = pose((0.02, -0.1, 0.01), (-120.0, 1.5, 2.0))  # first camera to second
 
 
 def write_stereo(path, names=("M{}", "D{}", "R", "T"), size=None, rotation=STEREO[:3, :3]):
+    """Write a stereo calibration as OpenCV's samples do; `size`: how it holds the image size, if at all."""
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     for index in (0, 1):
         storage.write(names[0].format(index + 1), MATRICES[index])

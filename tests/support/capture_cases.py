@@ -9,6 +9,7 @@ K = np.array([[70.0, 0, 42], [0, 72, 29], [0, 0, 1]])
 
 
 def camera(name, position=(0, 0, 0), **changes):
+    """A camera of 80 x 60 pixels at a position, looking along z."""
     extrinsics = np.eye(4)
     extrinsics[:3, 3] = position
     return replace(Camera(name, 80, 60, K, extrinsics), **changes)

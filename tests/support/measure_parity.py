@@ -25,7 +25,7 @@ from idesplat.runtime.inference.session import SessionConfig, open_session, run_
 from parity_cases import CASES as IDESPLAT_CASES
 from parity_cases import DEPTHSPLAT_CASES as DEPTHSPLAT_CASES
 from parity_cases import as_reference
-from reference_weights import draw_state_dict, read_arrays, read_meta
+from reference_weights import random_state_dict, read_arrays, read_meta
 from rich.console import Console
 from rich.table import Table
 
@@ -44,7 +44,7 @@ def main() -> None:
     torch.set_num_threads(THREADS)
     for case, preset in {**IDESPLAT_CASES, **DEPTHSPLAT_CASES}.items():
         model = build(preset).eval()
-        fill(model, draw_state_dict(case), Path(case))
+        fill(model, random_state_dict(case), Path(case))
         arrays = read_arrays(case)
         inputs = [arrays["image"] / 255, *(arrays[name] for name in INPUTS[1:])]
         with tempfile.TemporaryDirectory() as folder:

@@ -131,7 +131,7 @@ def _places(value: Any) -> Iterator[tuple[Any, Any]]:
 
 
 def make_odd_paths(folder: Path) -> list[str]:
-    """Paths of what is no regular file, or has a name that is hard to bear, made in a folder."""
+    """Paths of what is no regular file, or has an awkward name, made in a folder."""
     os.mkfifo(folder / "pipe.json")
     os.mkfifo(folder / "pipe.ply")
     (folder / "loop.ply").symlink_to("loop.ply")

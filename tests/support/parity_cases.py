@@ -10,6 +10,7 @@ DEPTHSPLAT_CASES = {
 
 
 def share_within(found, expected, tolerance):
+    """The share of elements that are off by no more than the tolerance."""
     return ((found - expected).abs() <= tolerance).float().mean().item()
 
 

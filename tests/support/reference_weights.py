@@ -1,4 +1,4 @@
-"""The reference cases' weights, which anyone can draw again: a tensor depends on its key, shape, seed and gain."""
+"""The reference cases' weights, which are generated: a tensor depends on its key, shape, seed and gain."""
 
 import json
 import zlib
@@ -12,7 +12,7 @@ FOLDER = Path(__file__).parent.parent / "data" / "reference"
 SMALL = {"pos_embed", "cls_token", "mask_token", "k_pe", "v_pe", "rpe", "relative_position_bias_table"}
 
 
-def draw_tensor(key: str, shape: tuple[int, ...], seed: int, gain: float) -> np.ndarray:
+def random_tensor(key: str, shape: tuple[int, ...], seed: int, gain: float) -> np.ndarray:
     """The float32 tensor that a released checkpoint of the case would hold under `key`."""
     normal = np.random.default_rng([seed, zlib.crc32(key.encode())]).standard_normal(shape, dtype=np.float32)
     leaf = key.rpartition(".")[2]
@@ -25,12 +25,12 @@ def draw_tensor(key: str, shape: tuple[int, ...], seed: int, gain: float) -> np.
     return 0.1 * normal
 
 
-def draw_state_dict(case: str) -> dict[str, torch.Tensor]:
+def random_state_dict(case: str) -> dict[str, torch.Tensor]:
     """All floating-point tensors of a case, under the keys of a released checkpoint without their `encoder.` prefix."""
     keys = json.loads((FOLDER / case / "state_dict_keys.json").read_text())
     weights = read_meta(case)["weights"]
     return {
-        key: torch.from_numpy(np.ascontiguousarray(draw_tensor(key, tuple(shape), **weights), np.float32))
+        key: torch.from_numpy(np.ascontiguousarray(random_tensor(key, tuple(shape), **weights), np.float32))
         for key, (shape, dtype) in keys.items()
         if dtype == "float32"
     }

@@ -1,4 +1,4 @@
-"""Scenes as files: chunks of the released datasets, splat files, snapshots of folders."""
+"""Scenes as files: chunks of the released datasets, small splat files, and what a folder holds."""
 
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from idesplat.runtime.splats.gaussians import Gaussians
 
 
 def as_scene(folder: Path, key: str) -> dict[str, Any]:
-    """A folder of photographs as a chunk's scene."""
+    """A folder of images with transforms.json as a scene of a RealEstate10K chunk."""
     rows, images = [], []
     for camera in read_cameras(folder / "transforms.json"):
         (fx, _, cx), (_, fy, cy) = camera.K[:2] / [[camera.width], [camera.height]]
@@ -31,6 +31,7 @@ IDENTITY = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 
 
 def write_scene(path):
+    """Write a .ply of 20 grey Gaussians."""
     rng = np.random.default_rng(0)
     quats, opacities = np.tile(np.float32([1, 0, 0, 0]), (20, 1)), np.full(20, 0.9, np.float32)
     means = rng.uniform([-1, -1, 3], [1, 1, 5], (20, 3)).astype(np.float32)
@@ -40,6 +41,7 @@ def write_scene(path):
 
 
 def pinholes(names):
+    """Cameras of 16 x 16 pixels side by side, one for each name."""
     K = np.array([[16.0, 0, 8], [0, 16, 8], [0, 0, 1]])
     poses = [np.array(IDENTITY, float) for _ in names]
     for index, pose in enumerate(poses):

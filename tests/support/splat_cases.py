@@ -103,15 +103,18 @@ def ellipsoid_turns(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
 
 
 def without_bands(gaussians: Gaussians, degree: int) -> Gaussians:
+    """The Gaussians with the SH coefficients up to a degree."""
     arrays = [getattr(gaussians, name).copy() for name in ARRAYS]
     return Gaussians(*arrays[:-1], np.ascontiguousarray(arrays[-1][:, : (degree + 1) ** 2]))
 
 
 def highest_degree(suffix: str) -> int:
+    """The highest SH degree that a format holds."""
     return 0 if suffix == ".splat" else 3
 
 
 def gzipped(content: bytes) -> bytes:
+    """The content compressed as a gzip stream."""
     compressor = zlib.compressobj(wbits=31)
     return compressor.compress(content) + compressor.flush()
 
@@ -119,6 +122,7 @@ def gzipped(content: bytes) -> bytes:
 def spz_header(
     count: int = 0, version: int = 3, degree: int = 0, bits: int = 12, flags: int = 0, magic: bytes = b"NGSP"
 ) -> bytes:
+    """The header of an .spz file, before compression."""
     numbers = np.array([version, count], "<u4").tobytes() + bytes([degree, bits, flags, 0])
     return magic + numbers
 

@@ -51,6 +51,7 @@ net (float[views, 3, height, width] images, float[views, 4, 4] extrinsics, float
 
 
 def write_model(path: Path, text: str = NETWORK, **changes: object) -> Path:
+    """Write a graph with the metadata OWN, of which fields may be changed; the path."""
     model = onnx.parser.parse_model(text)
     helper.set_model_props(model, {METADATA_KEY: json.dumps(asdict(OWN) | changes)})
     path.write_bytes(model.SerializeToString())
@@ -58,6 +59,7 @@ def write_model(path: Path, text: str = NETWORK, **changes: object) -> Path:
 
 
 def arrays(views: int = 2, height: int = 32, width: int = 48) -> dict[str, np.ndarray]:
+    """Inputs of such a graph: images of noise, cameras side by side, normalized intrinsics."""
     images = np.random.default_rng(0).random((views, 3, height, width), np.float32)
     extrinsics = np.tile(np.eye(4, dtype=np.float32), (views, 1, 1))
     extrinsics[:, 0, 3] = np.arange(views)

@@ -24,7 +24,7 @@ from idesplat.model.depthsplat.cost_volume import by_gathering, by_sampling
 from idesplat.model.registry import PRESETS, build
 from idesplat.runtime.inference.metadata import INPUTS
 from idesplat.runtime.inference.session import open_session, run_session
-from reference_weights import draw_tensor
+from reference_weights import random_tensor
 
 VIEWS = sorted((Path(__file__).parent.parent.parent / "data" / "depthsplat-views").glob("*.npz"))
 
@@ -44,7 +44,7 @@ def views(request):
     model = build(replace(config, vit=replace(config.vit, depth=4, out_indices=(0, 1, 2, 3)))).eval()
     seed, gain = expected["seed"].item(), expected["gain"].item()
     shapes = {name: tuple(value.shape) for name, value in model.state_dict().items()}
-    drawn = {name: draw_tensor(former_name(name), shape, seed, gain) for name, shape in shapes.items()}
+    drawn = {name: random_tensor(former_name(name), shape, seed, gain) for name, shape in shapes.items()}
     model.load_state_dict({name: torch.from_numpy(value.astype(np.float32)) for name, value in drawn.items()})
     images = resize(expected["thumbnails"] / 255, *map(int, size.split("x")))
     cameras = [expected[name] for name in INPUTS[1:]]

@@ -16,7 +16,7 @@ from idesplat.model.registry import build
 from idesplat.runtime.inference.session import open_session, run_session
 from parity_cases import DEPTHSPLAT_CASES as CASES
 from parity_cases import as_reference, share_within
-from reference_weights import draw_state_dict, read_arrays, read_meta
+from reference_weights import random_state_dict, read_arrays, read_meta
 
 pytestmark = pytest.mark.parity
 
@@ -30,7 +30,7 @@ def case(request):
     """Expected arrays, strides, and the network with the case's weights."""
     expected, meta = read_arrays(request.param), read_meta(request.param)
     model = build(CASES[request.param]).eval()
-    fill(model, draw_state_dict(request.param), Path(request.param))
+    fill(model, random_state_dict(request.param), Path(request.param))
     assert sum(parameter.numel() for parameter in model.parameters()) == meta["parameters"]
     expected["images"] = expected["image"] / 255
     return expected, meta, model

@@ -20,7 +20,7 @@ from idesplat.model.idesplat.dpbu import Cameras
 from idesplat.model.idesplat.network import IDESplat
 from idesplat.model.registry import PRESETS
 from parity_cases import CASES, as_reference, share_within
-from reference_weights import draw_state_dict, read_arrays, read_meta
+from reference_weights import random_state_dict, read_arrays, read_meta
 
 pytestmark = pytest.mark.parity
 
@@ -33,7 +33,7 @@ def case(request):
     """Expected arrays, strides, and our tensors by the same names, each stage from the reference's inverse depth."""
     expected, meta = read_arrays(request.param), read_meta(request.param)
     model = IDESplat(PRESETS[CASES[request.param]]).eval()
-    fill(model, draw_state_dict(request.param), Path(request.param))
+    fill(model, random_state_dict(request.param), Path(request.param))
     images = expected["image"] / 255
     cameras = Cameras(*(expected[name] for name in ("extrinsics", "intrinsics", "near", "far")))
     found = {}

@@ -24,7 +24,7 @@ from camera_cases import (
     colmap_model,
     inverse,
     known,
-    save_pictures,
+    save_images,
     write_stereo,
 )
 from idesplat.runtime.cameras.camera import Camera
@@ -175,7 +175,7 @@ def test_re10k(tmp_path):
     assert detect_format(tmp_path / "0000cc6d8b108390.txt") is CameraFormat.RE10K
     with pytest.raises(InputError, match=r"no image is named by one of its 3 timestamps.*--images"):
         read_cameras(tmp_path / "0000cc6d8b108390.txt")
-    pictures = save_pictures(tmp_path / "frames", ["52586000.png", "52619000.png"])
+    pictures = save_images(tmp_path / "frames", ["52586000.png", "52619000.png"])
     assert_same(read_cameras(tmp_path / "0000cc6d8b108390.txt", pictures), cameras)
     assert_same(read_cameras(tmp_path / "0000cc6d8b108390.txt", pictures, CameraFormat.RE10K), cameras)
 
@@ -188,7 +188,7 @@ def test_llff(tmp_path):
     np.save(tmp_path / "poses_bounds.npy", as_llff(cameras))
     assert detect_format(tmp_path / "poses_bounds.npy") is CameraFormat.LLFF
     assert [camera.name for camera in read_cameras(tmp_path)] == ["000", "001"]
-    pictures = save_pictures(tmp_path / "images", ["IMG_2.png", "IMG_10.png"])
+    pictures = save_images(tmp_path / "images", ["IMG_2.png", "IMG_10.png"])
     for given in ([], pictures, pictures[:1]):
         read = read_cameras(tmp_path / "poses_bounds.npy", given)
         assert_same(read, cameras)
@@ -219,7 +219,7 @@ def test_cam_txt(tmp_path, depths, expected):
     (tmp_path / "cams" / "pair.txt").write_text("2\n")
     with pytest.raises(InputError, match=r"00000000_cam\.txt: gives no size in pixels.*--images"):
         read_cameras(tmp_path / "cams")
-    save_pictures(tmp_path / "images", [camera.name for camera in cameras])
+    save_images(tmp_path / "images", [camera.name for camera in cameras])
     assert detect_format(tmp_path / "cams") is detect_format(tmp_path / "cams" / "00000003_cam.txt") is CameraFormat.DTU
     read = read_cameras(tmp_path / "cams")
     assert_same(read, cameras)
@@ -234,7 +234,7 @@ def test_cam_txt(tmp_path, depths, expected):
 
 def test_dtu_counts_pictures_from_one_and_may_give_K_for_a_quarter(tmp_path):
     cameras = known(["rect_001_3_r5000.png", "rect_004_3_r5000.png"])
-    pictures = save_pictures(tmp_path / "scan1", [camera.name for camera in cameras])
+    pictures = save_images(tmp_path / "scan1", [camera.name for camera in cameras])
     for camera, number in zip(cameras, (0, 3), strict=True):
         quarter = np.diag([0.25, 0.25, 1]) @ K
         (tmp_path / f"{number:08}_cam.txt").write_text(as_cam_txt(camera, quarter, "425 2.5"))
@@ -262,7 +262,7 @@ def test_stereo_calibration(tmp_path, suffix, size):
     path = tmp_path / f"stereo{suffix}"
     write_stereo(path, size=size)
     assert detect_format(path) is CameraFormat.OPENCV
-    pictures = save_pictures(tmp_path / "pair", ["im0.png", "im1.png"])
+    pictures = save_images(tmp_path / "pair", ["im0.png", "im1.png"])
     cameras = read_cameras(path, pictures)
     assert [camera.name for camera in cameras] == ["im0.png", "im1.png"]
     assert_stereo(cameras)

@@ -12,7 +12,7 @@ from camera_cases import (
     as_re10k,
     colmap_model,
     known,
-    save_pictures,
+    save_images,
     write_stereo,
 )
 from hypothesis import HealthCheck, given, settings
@@ -45,7 +45,7 @@ quick = settings(max_examples=60, suppress_health_check=[HealthCheck.function_sc
 
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory):
-    return save_pictures(tmp_path_factory.mktemp("pictures"), NAMES, 64, 48)
+    return save_images(tmp_path_factory.mktemp("pictures"), NAMES, 64, 48)
 
 
 def small(names=NAMES, matrix=K):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from camera_cases import CENTRED, as_llff, as_re10k, assert_same, colmap_model, known, save_pictures
+from camera_cases import CENTRED, as_llff, as_re10k, assert_same, colmap_model, known, save_images
 from conftest import run_command
 from idesplat.runtime.cameras.io import CameraFormat, detect_format, read_cameras
 from idesplat.runtime.cli.cameras import main
@@ -41,10 +41,10 @@ def test_pictures_give_the_size(folder, capsys):
     Path("trajectory.txt").write_text(as_re10k(cameras))
     assert run_command(main, "convert", "trajectory.txt", "cameras.json") == 2
     assert "give the pictures with --images" in capsys.readouterr().err and not Path("cameras.json").exists()
-    save_pictures(folder / "frames", ["100.png"])
+    save_images(folder / "frames", ["100.png"])
     assert run_command(main, "convert", "trajectory.txt", "cameras.json", "--images", "frames") == 0
     assert_same(read_cameras(Path("cameras.json")), cameras)
-    first, second = save_pictures(folder / "frames", ["100.png", "200.png"])  # as a shell expands a pattern
+    first, second = save_images(folder / "frames", ["100.png", "200.png"])  # as a shell expands a pattern
     assert run_command(main, "convert", "trajectory.txt", "other.json", "--images", first, second) == 0
     assert_same(read_cameras(Path("other.json")), cameras)
 
