@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from .runtime.inference.metadata import ModelMetadata
     from .runtime.inference.predictor import Prediction, Predictor
     from .runtime.inference.predictor import Predictor as Runner
+    from .runtime.reconstruction.pipeline import reconstruct
+    from .runtime.reconstruction.result import Reconstruction
     from .runtime.rendering.rasterizer import rasterize
     from .runtime.rendering.render import render
     from .runtime.sfm.estimate import estimate_cameras
@@ -35,6 +37,7 @@ _MODULE_OF = {
     "ModelMetadata": "runtime.inference.metadata",
     "Prediction": "runtime.inference.predictor",
     "Predictor": "runtime.inference.predictor",
+    "Reconstruction": "runtime.reconstruction.result",
     "bundled_model": "runtime.inference.bundled_model",
     "estimate_cameras": "runtime.sfm.estimate",
     "export_checkpoint": "export.pipeline",
@@ -44,6 +47,7 @@ _MODULE_OF = {
     "read_offset": "runtime.splats.io",
     "read_ply": "runtime.splats.formats.ply",
     "read_splats": "runtime.splats.io",
+    "reconstruct": "runtime.reconstruction.pipeline",
     "render": "runtime.rendering.render",
     "write_cameras": "runtime.cameras.io",
     "write_ply": "runtime.splats.formats.ply",
@@ -57,6 +61,7 @@ __all__ = [
     "ModelMetadata",
     "Prediction",
     "Predictor",
+    "Reconstruction",
     "Runner",
     "__version__",
     "bundled_model",
@@ -68,6 +73,7 @@ __all__ = [
     "read_offset",
     "read_ply",
     "read_splats",
+    "reconstruct",
     "render",
     "write_cameras",
     "write_ply",

@@ -8,16 +8,17 @@ from typing import Annotated
 
 import typer
 
-from ..runtime.cli.outputs import Overwrite
+from ..runtime.cli.options import Config, Overwrite, Quiet
+from ..runtime.cli.outputs import command
+from ..runtime.cli.reporting import note
 from ..runtime.cli.terminal import run, say, warn
-from ..runtime.errors import exit_on_input_error
 from ..runtime.images.sizes import parse_size
 from .pipeline import MAX_VIEWS, MIN_VIEWS, ExportResult, MismatchError, export_checkpoint
 
 MISMATCH = 1  # exit status
 
 
-@exit_on_input_error
+@command("idesplat export")
 def export(
     checkpoint: Annotated[
         Path, typer.Argument(help="Released checkpoint: .ckpt, .pth or .safetensors.", show_default=False)
@@ -33,7 +34,18 @@ def export(
     size: Annotated[str | None, typer.Option(help="Make the image size static, such as 256x256.")] = None,
     precision: Annotated[str, typer.Option(help="float32, int8 (for CPUs) or fp16 (for GPUs).")] = "float32",
     overwrite: Overwrite = False,
-    verbose: Annotated[bool, typer.Option("--verbose", help="Print the error of every tensor in every case.")] = False,
+    config: Config = None,
+    verbose: Annotated[
+        int,
+        typer.Option(
+            "--verbose",
+            "-v",
+            count=True,
+            help="Print the error of every tensor in every case, and log to stderr what is done; twice: in detail.",
+            show_default=False,
+        ),
+    ] = 0,
+    quiet: Quiet = False,
 ) -> None:
     """Write a checkpoint as a standard ONNX graph (opset 20), and verify it against PyTorch.
 
@@ -51,10 +63,10 @@ def export(
                 overwrite=overwrite,
             )
         except MismatchError as error:
-            _print_errors(error, verbose)
+            _print_errors(error, bool(verbose))
             warn(f"error: {error} (see the table)")
             raise SystemExit(MISMATCH) from None
-    _print_errors(result, verbose)
+    _print_errors(result, bool(verbose))
     _print_files(result)
 
 
@@ -71,7 +83,7 @@ class _TerminalHandler(logging.Handler):
         if record.levelno >= logging.WARNING:
             warn(f"warning: {record.getMessage()}")
         else:
-            say(record.getMessage())
+            note(record.getMessage())
 
 
 @contextmanager
@@ -101,4 +113,4 @@ def _print_files(result: ExportResult) -> None:
         say(f"{weights.name} holds the weights: move it along with {graphs[0].name}")
     makes = "Gaussians" if result.metadata.gaussians else "depth and a point cloud"
     for graph in graphs:
-        say(f"make {makes} with: idesplat-infer --model {graph} --images ... --cameras ... --out scene.ply")
+        say(f"make {makes} with: idesplat infer PHOTOS --model {graph}")

@@ -5,14 +5,12 @@ print it without a traceback and exit with `EXIT_STATUS`; library users catch `I
 """
 
 import contextlib
-import functools
-import signal
 import sys
 import unicodedata
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 EXIT_STATUS = 2
 SIGNALLED = 128  # a shell's exit status of a command that a signal ended is this and the signal's number
@@ -52,33 +50,6 @@ def report_error(message: str) -> None:
         line = f"{line[: MAX_ERROR_LENGTH // 2]} ... {line[-MAX_ERROR_LENGTH // 2 :]}"
     with contextlib.suppress(OSError):
         print(f"error: {line}", file=sys.stderr)
-
-
-def exit_on_input_error(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Make a command print an `InputError` as one line on stderr and exit with status 2.
-
-    The same goes for what the system refuses, and for too little memory. A signal ends it as shells expect.
-    """
-
-    @functools.wraps(command)
-    def wrapped(*args: Any, **kwargs: Any) -> Any:
-        try:
-            return command(*args, **kwargs)
-        except InputError as error:
-            report_error(str(error))
-        except MemoryError:
-            report_error("memory ran out; give a smaller file, fewer or smaller images, or use a larger machine")
-        except BrokenPipeError:  # whoever read the output has seen enough
-            raise SystemExit(BROKEN_PIPE) from None
-        except OSError as error:
-            if error.strerror is None:  # not the system's
-                raise
-            report_error(f"{error.filename}: {error.strerror}" if error.filename else error.strerror)
-        except KeyboardInterrupt as interrupt:
-            raise SystemExit(SIGNALLED + getattr(interrupt, "signal_number", signal.SIGINT)) from None
-        raise SystemExit(EXIT_STATUS)
-
-    return wrapped
 
 
 def _is_shown(character: str) -> bool:

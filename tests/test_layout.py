@@ -22,7 +22,7 @@ FORBIDDEN = {
 ORDERS = {
     "runtime": (
         *("errors", "system", "startup", "geometry", "images", "cameras", "sfm", "views", "splats", "inference"),
-        *("rendering", "viewer", "cli"),
+        *("rendering", "viewer", "reconstruction", "cli"),
     ),
     "model": ("config", "common", "family", "idesplat", "depthsplat", "registry", "checkpoint"),
     "export": (

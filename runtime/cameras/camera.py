@@ -1,7 +1,10 @@
 """The camera model: intrinsics, distortion and pose of one image."""
 
+import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -104,3 +107,24 @@ def _check_distortion(distortion: tuple[float, ...] | None, fisheye: bool) -> No
 def _check_depth_range(depth_range: tuple[float, float]) -> None:
     if len(depth_range) != 2 or not np.isfinite(depth_range).all() or not 0 < depth_range[0] < depth_range[1]:
         raise InputError(f"the depth range is {depth_range}, expected 0 < near < far")
+
+
+MAX_SIDE = 1_000_000  # pixels
+
+
+def named_from(folder: Path, cameras: Sequence[Camera], frames: Path | None = None) -> list[Camera]:
+    """The cameras, their images named as seen from a folder, where they are files.
+
+    frames: where frames of a video lie for a while; these keep their name alone.
+    """
+    named = []
+    for camera in cameras:
+        if Path(camera.name).parent == frames:
+            camera = replace(camera, name=Path(camera.name).name)
+        elif Path(camera.name).is_file():
+            name = os.path.realpath(camera.name)
+            with suppress(ValueError):  # on another drive of Windows
+                name = os.path.relpath(name, os.path.realpath(folder))
+            camera = replace(camera, name=Path(name).as_posix())
+        named.append(camera)
+    return named

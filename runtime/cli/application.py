@@ -27,7 +27,7 @@ COMMANDS = {
     "view": SubCommand(".view", "view", "Look at a splat file in the browser."),
     "render": SubCommand(".render", "render", "A splat file to images or a video."),
     "convert": SubCommand(".convert", "convert", "A splat file to another format."),
-    "cameras": SubCommand(".cameras", "app", "Convert cameras between formats."),
+    "cameras": SubCommand(".cameras", "app", "Estimate cameras, or convert them between formats."),
     "eval": SubCommand("...tools.evaluation.cli", "app", "Novel-view and depth metrics of a model."),
     "bench": SubCommand("...tools.benchmark.cli", "bench", "Time and memory of models."),
     "train": SubCommand("...tools.training.cli", "train", "Train IDESplat on synthetic scenes or photographs."),

@@ -1,22 +1,26 @@
-"""The command idesplat-convert: one splat file to another."""
+"""The command `idesplat convert`: one splat file to another."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from ..errors import InputError, exit_on_input_error
-from .outputs import Overwrite, guards_outputs, outputs
+from ..errors import InputError
+from .options import Config, Overwrite, Quiet, Verbose
+from .outputs import command, outputs
+from .reporting import note
 from .terminal import run, say
 
 
-@exit_on_input_error
-@guards_outputs("idesplat-convert")
+@command("idesplat convert")
 def convert(
     scene: Annotated[Path, typer.Argument(help="Splat file to read.", show_default=False)],
     out: Annotated[Path, typer.Argument(help="File to write.", show_default=False)],
-    min_opacity: Annotated[float, typer.Option(help="Leave out fainter Gaussians, 0 to 1.")] = 0,
+    min_opacity: Annotated[float, typer.Option(help="Leave out Gaussians of lower opacity, 0 to 1.")] = 0,
     overwrite: Overwrite = False,
+    config: Config = None,
+    verbose: Verbose = 0,
+    quiet: Quiet = False,
 ) -> None:
     """Write a splat file in another format, which follows from the file's name.
 
@@ -36,12 +40,12 @@ def convert(
         whole, gaussians = len(gaussians), gaussians.select(gaussians.opacities >= min_opacity)
         if not len(gaussians):
             raise InputError(f"--min-opacity {min_opacity:g}: no Gaussian is left of {whole}; use a smaller one")
-        say(describe_removed({"min_opacity": whole - len(gaussians)}, len(gaussians)))
-    for note in write_splats(out, gaussians, read_offset(scene)):
-        say(f"note: {note}")
+        note(describe_removed({"min_opacity": whole - len(gaussians)}, len(gaussians)))
+    for line in write_splats(out, gaussians, read_offset(scene)):
+        note(f"note: {line}")
     say(f"wrote {out}: {len(gaussians):,} Gaussians, {out.stat().st_size / 1e6:.1f} MB")
 
 
 def main() -> None:
-    """Entry point of idesplat-convert."""
+    """Run the command."""
     run(convert)

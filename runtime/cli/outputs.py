@@ -4,7 +4,7 @@ An output is refused if it is a file that the same run reads, if it is another o
 no command of ours wrote it (see `written_files`). The option --overwrite lifts the last of these alone: nothing is
 gained by replacing what is being read.
 
-A command is decorated with `guards_outputs`; inside, `outputs()` takes its inputs and outputs as soon as they are
+A command is decorated with `command`; inside, `outputs()` takes its inputs and outputs as soon as they are
 known. Whatever is written through `files.replacing` without having been announced is checked then.
 """
 
@@ -13,27 +13,20 @@ import itertools
 import os
 import stat
 import sys
-import unicodedata
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
 from contextvars import ContextVar
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from types import TracebackType
-from typing import Annotated, Any, Self, TextIO
-
-import typer
+from typing import Any, Self, TextIO
 
 from ..errors import InputError
+from ..images.naming import without_case
 from ..system.files import GUARD, atomic_write, check_writable
 from ..system.output_records import WrittenFile, add_to_record, is_unchanged, read_record
+from .reporting import reporting
 
 STANDARD_OUTPUT = Path("-")  # as the value of --json
-UNNAMED = "image"  # for a file whose image has no name
-
-Overwrite = Annotated[
-    bool, typer.Option("--overwrite", help="Replace existing files that idesplat did not write, too; never inputs.")
-]
 
 
 class Outputs:
@@ -169,7 +162,7 @@ class Outputs:
 
     def _comparable(self, path: Path) -> object:
         """The key under which two outputs are the same, on whatever file system."""
-        return "output", _without_case(self._real(path))
+        return "output", without_case(self._real(path))
 
     def _identities(self, path: Path) -> list[object]:
         """The keys under which a path is known: where it leads, and, if there is a file, which one that is."""
@@ -200,19 +193,20 @@ def outputs() -> Outputs:
     return _CURRENT.get() or Outputs("idesplat")
 
 
-def guards_outputs(name: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Make a command's `outputs()` guard all that it writes, and have `--json -` keep standard output for itself.
+def command(name: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """What every command has: `outputs()` guard all that it writes, `--json -` keeps standard output for itself.
 
-    name: the command's. Its parameters `overwrite` and `json_path` are looked at, where it has them.
+    name: the command's. Of its parameters `overwrite`, `json_path`, `quiet` and `verbose` are used here.
     """
 
-    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
-        @functools.wraps(command)
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(function)
         def wrapped(*args: Any, **kwargs: Any) -> Any:
             with Outputs(name, bool(kwargs.get("overwrite"))), ExitStack() as stack:
                 if kwargs.get("json_path") == STANDARD_OUTPUT:
                     stack.enter_context(redirect_stdout(sys.stderr))
-                return command(*args, **kwargs)
+                stack.enter_context(reporting(bool(kwargs.get("quiet")), int(kwargs.get("verbose") or 0)))
+                return function(*args, **kwargs)
 
         return wrapped
 
@@ -237,41 +231,6 @@ def check_can_create(folder: Path) -> None:
         if not place.is_dir():
             raise InputError(f"cannot write into {folder}: {place} is not a folder; choose another")
     check_writable(place)
-
-
-def name_files(images: Sequence[str], endings: Sequence[str] = ("",)) -> list[str]:
-    """File names, without ending, for what is made of images: theirs without folder and suffix where these differ.
-
-    Else the folders stand in front (left-0001, right-0001), and where that is not enough every image's number. No two
-    of the names differ in case alone, and none is another one with an ending, so that `a` with the ending `-depth` and
-    `a-depth` are told apart.
-    """
-    from ..images.io import image_stem  # loads OpenCV, which a help text does not need
-
-    paths = [PurePosixPath(image.replace("\\", "/")) for image in images]
-    stems = [image_stem(path) or UNNAMED for path in paths]
-    if _distinct(stems, endings):
-        return stems
-    levels = zip(*(path.parts[:-1] for path in paths), strict=False)
-    common = len(list(itertools.takewhile(lambda level: len(set(level)) == 1, levels)))
-    nested = [
-        "-".join([*(part for part in path.parts[common:-1] if part not in ("/", "..")), name])
-        for path, name in zip(paths, stems, strict=True)
-    ]
-    if _distinct(nested, endings):
-        return nested
-    digits = len(str(len(stems) - 1))
-    return [f"{index:0{digits}}-{name}" for index, name in enumerate(stems)]
-
-
-def _distinct(names: Sequence[str], endings: Sequence[str]) -> bool:
-    counts = Counter(_without_case(name + ending) for name in names for ending in endings)
-    return all(count == 1 for count in counts.values())
-
-
-def _without_case(text: str) -> str:
-    """The same for names that a file system may take for one: Windows and macOS ignore case, macOS how é is encoded."""
-    return unicodedata.normalize("NFC", text).casefold()
 
 
 def _existing(option: str, path: Path) -> bool:

@@ -1,4 +1,4 @@
-"""The command idesplat-render: a splat file to pictures or a video."""
+"""The command `idesplat render`: a splat file to images or a video."""
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -9,9 +9,10 @@ import numpy as np
 import typer
 
 from ..cameras.camera import Camera, offset_cameras
-from ..cameras.io import CameraFormat, read_cameras
-from ..errors import InputError, exit_on_input_error
+from ..cameras.io import read_cameras
+from ..errors import InputError
 from ..images.colormaps import colormap_depth, inverse_depth_range
+from ..images.naming import name_files
 from ..images.png import save_png
 from ..images.sizes import parse_size
 from ..images.video_writer import check_video_support, open_video
@@ -34,53 +35,62 @@ from ..splats.io import read_offset, read_splats
 from ..system.files import atomic_write
 from ..system.progress import progress
 from .input_files import camera_files, named_images, nearby_images
-from .outputs import Overwrite, guards_outputs, name_files, outputs
+from .options import Cameras, CamerasFormat, Config, Overwrite, Quiet, Verbose, parse_count
+from .outputs import command, outputs
 from .terminal import run, say
 
-COMMAND = "idesplat-render"
-VIDEO, PICTURE = ".mp4", ".png"
-COLOUR, DEPTH, ALPHA = "", "-depth", "-alpha"  # what a picture shows, as its name ends
+COMMAND = "idesplat render"
+VIDEO, IMAGE = ".mp4", ".png"
+COLOUR, DEPTH, ALPHA = "", "-depth", "-alpha"  # what an image shows, as its name ends
 SOLID = 0.5  # alpha from which on a pixel has a depth
 SIZE = "360x640"  # where neither cameras nor --size say so
 MOST_LISTED = 12  # files that are named one by one
 
 
-@exit_on_input_error
-@guards_outputs(COMMAND)
+@command(COMMAND)
 def render(
     scene: Annotated[Path, typer.Argument(help="Splat file of any format.", show_default=False)],
-    out: Annotated[Path, typer.Option(help="Folder for pictures, one .png, or one .mp4.", show_default=False)],
-    cameras: Annotated[Path | None, typer.Option(help="Cameras, such as a transforms.json.")] = None,
-    camera_format: Annotated[
-        CameraFormat | None, typer.Option(help="What --cameras is, where that is not recognised.")
-    ] = None,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder for images, one .png, or one .mp4.", show_default=False)
+    ],
+    cameras: Cameras = None,
+    camera_format: CamerasFormat = None,
     orbit: Annotated[bool, typer.Option("--orbit", help="Go around the scene.")] = False,
     path: Annotated[bool, typer.Option("--path", help="Go smoothly through the cameras.")] = False,
     degrees: Annotated[
         float | None, typer.Option(help="Of the orbit: 360 by default, with cameras a swing of 30.", show_default=False)
     ] = None,
-    frames: Annotated[int, typer.Option(help=f"How many pictures --orbit and --path make, 1 to {MAX_FRAMES}.")] = 90,
+    frames: Annotated[
+        int,
+        typer.Option(
+            help=f"How many images --orbit and --path make, 1 to {MAX_FRAMES}.", parser=parse_count, metavar="INTEGER"
+        ),
+    ] = 90,
     fps: Annotated[float, typer.Option(help="Frames a second of an .mp4.")] = 30,
     size: Annotated[
-        str | None, typer.Option(help=f"HEIGHTxWIDTH: the cameras' by default, or {SIZE}.", show_default=False)
+        str | None,
+        typer.Option(help=f"HEIGHTxWIDTH to render at; else the cameras' sizes, or {SIZE}.", show_default=False),
     ] = None,
-    depth: Annotated[bool, typer.Option("--depth", help="Draw depth, too (colours, and metric .npz).")] = False,
-    alpha: Annotated[bool, typer.Option("--alpha", help="Draw opacity, too.")] = False,
+    depth: Annotated[bool, typer.Option("--depth", help="Render depth, too (colours, and metric .npz).")] = False,
+    alpha: Annotated[bool, typer.Option("--alpha", help="Render opacity, too.")] = False,
     background: Annotated[
         str, typer.Option(help="Red, green and blue behind the scene, 0 to 1, such as 1,1,1.", metavar="R,G,B")
     ] = "0,0,0",
     overwrite: Overwrite = False,
+    config: Config = None,
+    verbose: Verbose = 0,
+    quiet: Quiet = False,
 ) -> None:
-    """Draw a splat file as the cameras see it, on a path through them, in an orbit, or from where all of it is seen.
+    """Render a splat file from cameras, on a path through them, in an orbit, or from where all of it is seen.
 
-    Pictures are named after the cameras' images and have the cameras' own size. They show the ideal pinhole view: where
-    a camera has lens distortion, compare with the undistorted photograph.
+    Images are named after the cameras' images and have the cameras' own size. They show the ideal pinhole view: where
+    a camera has lens distortion, compare with the undistorted image.
     """
     colour = _parse_background(background)
     if not 0 < fps <= 1000:
         raise InputError(f"--fps {fps:g}: expected frames a second, 1 to 1000")
     if not 1 <= frames <= MAX_FRAMES:
-        raise InputError(f"--frames {frames}: expected 1 to {MAX_FRAMES} pictures")
+        raise InputError(f"--frames {frames}: expected 1 to {MAX_FRAMES} images")
     _check_out(out)
     if path and orbit:
         raise InputError("--path and --orbit: expected one of them")
@@ -93,17 +103,17 @@ def render(
     _announce(scene, cameras, views, stems, out, kinds)
     gaussians = read_splats(scene)
     views = offset_cameras(views, read_offset(scene))
-    shots = _shots(gaussians, views, orbit, path, degrees, frames, size)
+    shots = _choose_cameras(gaussians, views, orbit, path, degrees, frames, size)
     check_image_sizes(shots)
-    draw = _drawer(gaussians, colour)
+    render_camera = _renderer(gaussians, colour)
     if out.suffix.lower() == VIDEO:
-        written = _film(draw, shots, out, fps, kinds)
+        written = _save_video(render_camera, shots, out, fps, kinds)
     else:
-        written = _pictures(draw, shots, stems, kinds)
+        written = _save_images(render_camera, shots, stems, kinds)
     for file in written if len(written) <= MOST_LISTED else [f"{len(written)} files in {out}"]:
         say(f"wrote {file}")
-    pictures = "1 picture" if len(shots) == 1 else f"{len(shots)} pictures"
-    say(f"{len(gaussians):,} Gaussians drawn in {pictures}; open {out} in any {_viewer(out)}")
+    images = "1 image" if len(shots) == 1 else f"{len(shots)} images"
+    say(f"{len(gaussians):,} Gaussians rendered in {images}; open {out} in any {_viewer(out)}")
 
 
 def main() -> None:
@@ -112,12 +122,12 @@ def main() -> None:
 
 
 def _check_out(out: Path) -> None:
-    """Refuse what is not made: a kind of picture or video by its name, or any video where its library is missing."""
-    from ..images.io import SUFFIXES as PICTURES
+    """Refuse what is not made: a kind of image or video by its name, or any video where its library is missing."""
+    from ..images.io import SUFFIXES as IMAGES
     from ..images.video_reader import SUFFIXES as VIDEOS
 
-    if out.suffix.lower() in {*PICTURES, *VIDEOS, ".gif"} - {PICTURE, VIDEO} and not out.is_dir():
-        raise InputError(f"--out {out}: expected a folder, or a file that ends in {PICTURE} or {VIDEO}")
+    if out.suffix.lower() in {*IMAGES, *VIDEOS, ".gif"} - {IMAGE, VIDEO} and not out.is_dir():
+        raise InputError(f"--out {out}: expected a folder, or a file that ends in {IMAGE} or {VIDEO}")
     if out.suffix.lower() == VIDEO:
         check_video_support()
 
@@ -138,29 +148,29 @@ def _announce(
 ) -> None:
     """Say what is read and what will be written, so that nothing is replaced that must not be; raises InputError.
 
-    The photographs are not read, but nothing may be drawn over them. What this command has drawn is none of them.
+    The cameras' images are not read, but must not be replaced. What this command has rendered is none of them.
     """
     run = outputs()
     run.reads("the scene", [scene])
     if cameras is not None:
         run.reads("the cameras", camera_files(cameras))
-        run.reads("a photograph", named_images(cameras, views))
+        run.reads("an image", named_images(cameras, views))
         nearby = nearby_images(cameras, views)
-        run.reads("a photograph", [image for image in nearby if run.writer_of(image) != COMMAND])
+        run.reads("an image", [image for image in nearby if run.writer_of(image) != COMMAND])
     if out.suffix.lower() == VIDEO:
-        run.writes("--out", [_film_path(out, kind) for kind in kinds])
+        run.writes("--out", [_video_path(out, kind) for kind in kinds])
         return
-    run.writes("--out", [_picture_path(stem, kind) for stem in stems for kind in kinds])
+    run.writes("--out", [_image_path(stem, kind) for stem in stems for kind in kinds])
     if DEPTH in kinds:
         run.writes("--out", [_metric_path(stem) for stem in stems])
 
 
-def _film_path(out: Path, kind: str) -> Path:
+def _video_path(out: Path, kind: str) -> Path:
     return out.with_stem(out.stem + kind)
 
 
-def _picture_path(stem: Path, kind: str) -> Path:
-    return stem.with_name(stem.name + kind + PICTURE)
+def _image_path(stem: Path, kind: str) -> Path:
+    return stem.with_name(stem.name + kind + IMAGE)
 
 
 def _metric_path(stem: Path) -> Path:
@@ -168,7 +178,7 @@ def _metric_path(stem: Path) -> Path:
     return stem.with_name(stem.name + DEPTH + ".npz")
 
 
-def _shots(
+def _choose_cameras(
     gaussians: Gaussians,
     views: Sequence[Camera],
     orbit: bool,
@@ -177,7 +187,7 @@ def _shots(
     frames: int,
     size: str | None,
 ) -> list[Camera]:
-    """Where to draw the scene from."""
+    """The cameras to render from."""
     if views and size:
         views = [fit_camera(view, *parse_size(size)) for view in views]
     if path:
@@ -188,15 +198,15 @@ def _shots(
     return list(views) or [overview_camera(gaussians, *parse_size(size or SIZE))]
 
 
-def _drawer(gaussians: Gaussians, background: tuple[float, float, float]) -> Callable[[Camera], Rendering]:
-    def draw(shot: Camera) -> Rendering:
+def _renderer(gaussians: Gaussians, background: tuple[float, float, float]) -> Callable[[Camera], Rendering]:
+    def render_camera(shot: Camera) -> Rendering:
         return render_view(gaussians, shot.extrinsics, shot.K, shot.width, shot.height, background)
 
-    return draw
+    return render_camera
 
 
-def _film(
-    draw: Callable[[Camera], Rendering], shots: Sequence[Camera], out: Path, fps: float, kinds: Sequence[str]
+def _save_video(
+    render_camera: Callable[[Camera], Rendering], shots: Sequence[Camera], out: Path, fps: float, kinds: Sequence[str]
 ) -> list[Path]:
     """A video of each kind; the paths written."""
     width, height = shots[0].width, shots[0].height
@@ -208,53 +218,55 @@ def _film(
             )
     limits: tuple[float, float] | None = None  # the first frame's, so that colours mean the same in all
     with ExitStack() as stack:
-        films = {kind: _film_path(out, kind) for kind in kinds}
-        add = {kind: stack.enter_context(open_video(film, width, height, fps)) for kind, film in films.items()}
-        for shot in progress(shots, "drawing"):
-            drawn = draw(shot)
-            limits = limits or inverse_depth_range(_depth(drawn))
+        videos = {kind: _video_path(out, kind) for kind in kinds}
+        add = {kind: stack.enter_context(open_video(video, width, height, fps)) for kind, video in videos.items()}
+        for shot in progress(shots, "rendering"):
+            rendering = render_camera(shot)
+            limits = limits or inverse_depth_range(_depth(rendering))
             for kind in kinds:
-                add[kind](_picture(drawn, kind, limits))
-    return list(films.values())
+                add[kind](_image(rendering, kind, limits))
+    return list(videos.values())
 
 
-def _pictures(
-    draw: Callable[[Camera], Rendering], shots: Sequence[Camera], stems: Sequence[Path], kinds: Sequence[str]
+def _save_images(
+    render_camera: Callable[[Camera], Rendering], shots: Sequence[Camera], stems: Sequence[Path], kinds: Sequence[str]
 ) -> list[Path]:
-    """A picture of each kind for each shot, and metric depth; the paths written."""
+    """An image of each kind for each camera, and metric depth; the paths written."""
     written = []
-    for shot, stem in progress(list(zip(shots, stems, strict=True)), "drawing"):
-        drawn = draw(shot)
+    for shot, stem in progress(list(zip(shots, stems, strict=True)), "rendering"):
+        rendering = render_camera(shot)
         for kind in kinds:
-            target = _picture_path(stem, kind)
-            save_png(target, _picture(drawn, kind))
+            target = _image_path(stem, kind)
+            save_png(target, _image(rendering, kind))
             written.append(target)
         if DEPTH in kinds:
             metric = _metric_path(stem)
             with atomic_write(metric) as temporary:
-                np.savez_compressed(temporary, depth=_depth(drawn))
+                np.savez_compressed(temporary, depth=_depth(rendering))
             written.append(metric)
     return written
 
 
-def _depth(drawn: Rendering) -> np.ndarray:
+def _depth(rendering: Rendering) -> np.ndarray:
     """The mean depth of what stops the light, in world units, 0 where most of it passes."""
-    return np.where(drawn.alpha >= SOLID, drawn.depth / np.maximum(drawn.alpha, SOLID), 0).astype(np.float32)
+    return np.where(rendering.alpha >= SOLID, rendering.depth / np.maximum(rendering.alpha, SOLID), 0).astype(
+        np.float32
+    )
 
 
-def _picture(drawn: Rendering, kind: str, limits: tuple[float, float] | None = None) -> np.ndarray:
-    """One kind of picture of a rendering, RGB in [0, 1], [height, width, 3]."""
+def _image(rendering: Rendering, kind: str, limits: tuple[float, float] | None = None) -> np.ndarray:
+    """One kind of image of a rendering, RGB in [0, 1], [height, width, 3]."""
     if kind == DEPTH:
-        return colormap_depth(_depth(drawn), limits)
-    return np.repeat(drawn.alpha[..., None], 3, axis=2) if kind == ALPHA else drawn.rgb
+        return colormap_depth(_depth(rendering), limits)
+    return np.repeat(rendering.alpha[..., None], 3, axis=2) if kind == ALPHA else rendering.rgb
 
 
 def _stems(names: Sequence[str], out: Path, kinds: Sequence[str]) -> list[Path]:
-    """The pictures' paths without kind and suffix; raises InputError if several are to go into one file."""
-    if out.suffix.lower() != PICTURE:
+    """The images' paths without kind and suffix; raises InputError if several are to go into one file."""
+    if out.suffix.lower() != IMAGE:
         return [out / name for name in name_files(names, kinds)]
     if len(names) > 1:
-        raise InputError(f"--out {out}: {len(names)} pictures do not fit one file; give a folder or an .mp4")
+        raise InputError(f"--out {out}: {len(names)} images do not fit one file; give a folder or an .mp4")
     return [out.with_suffix("")]
 
 

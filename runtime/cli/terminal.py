@@ -22,7 +22,6 @@ from ..errors import (
     SIGNALLED,
     InputError,
     Terminated,
-    exit_on_input_error,
     printable,
     report_error,
 )
@@ -89,23 +88,37 @@ def warn(text: str) -> None:
 
 
 def _status(app: typer.Typer) -> int:
-    """Run the application; its exit status."""
+    """Run the application; its exit status.
 
-    @exit_on_input_error
-    def call() -> Any:
-        return typer.main.get_command(app)(standalone_mode=False)
-
+    What is wrong with the input is printed as one line on stderr, and so is what the system refuses, and too little
+    memory.
+    """
     try:
-        status = call()
+        status = typer.main.get_command(app)(standalone_mode=False)
     except SystemExit as stop:
         status = stop.code
     except (KeyboardInterrupt, typer.Abort) as interrupt:
         status = SIGNALLED + getattr(interrupt, "signal_number", signal.SIGINT)
+    except InputError as error:
+        status = _fail(str(error))
+    except MemoryError:
+        status = _fail("memory ran out; give a smaller file, fewer or smaller images, or use a larger machine")
+    except BrokenPipeError:  # whoever read the output has seen enough
+        status = BROKEN_PIPE
+    except OSError as error:
+        if error.strerror is None:  # not the system's
+            raise
+        status = _fail(f"{error.filename}: {error.strerror}" if error.filename else error.strerror)
     except Exception as error:
         if not hasattr(error, "format_message"):  # only what is wrong with the arguments has a message of this kind
             raise
         status = _report_usage(error)
     return status if isinstance(status, int) else 0
+
+
+def _fail(message: str) -> int:
+    report_error(message)
+    return EXIT_STATUS
 
 
 def _report_usage(error: Any) -> int:

@@ -1,4 +1,4 @@
-"""The command idesplat-view: a splat file in a browser, served on this machine or as one file to send."""
+"""The command `idesplat view`: a splat file in a browser, served on this machine or as one file to send."""
 
 import contextlib
 import webbrowser
@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..cameras.io import CameraFormat
-from ..errors import InputError, Terminated, exit_on_input_error
-from .outputs import Overwrite, guards_outputs, outputs
+from ..errors import InputError, Terminated
+from .options import Cameras, CamerasFormat, Config, Images, MoreImages, Overwrite, Quiet, Verbose
+from .outputs import command, outputs
 from .terminal import run, say
 
 if TYPE_CHECKING:
@@ -21,19 +22,13 @@ LOOPBACK = "127.0.0.1"
 PORT = 8080
 
 
-@exit_on_input_error
-@guards_outputs("idesplat-view")
+@command("idesplat view")
 def view(
     scene: Annotated[Path, typer.Argument(help="Splat file of any format.", show_default=False)],
-    cameras: Annotated[Path | None, typer.Option(help="Cameras to draw, such as a transforms.json.")] = None,
-    camera_format: Annotated[
-        CameraFormat | None, typer.Option(help="What --cameras is, where that is not recognised.")
-    ] = None,
-    images: Annotated[
-        list[Path] | None,
-        typer.Option(help="Folder, glob or files of the cameras' photographs, or their video.", show_default=False),
-    ] = None,
-    more_images: Annotated[list[Path] | None, typer.Argument(hidden=True)] = None,
+    cameras: Cameras = None,
+    camera_format: CamerasFormat = None,
+    images: Images = None,
+    more_images: MoreImages = None,
     html: Annotated[
         Path | None, typer.Option(help="Write one .html that opens anywhere, without network, instead of serving.")
     ] = None,
@@ -41,10 +36,13 @@ def view(
     port: Annotated[int, typer.Option(help="Port to serve at, 0 for any.", min=0, max=65535)] = PORT,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
     overwrite: Overwrite = False,
+    config: Config = None,
+    verbose: Verbose = 0,
+    quiet: Quiet = False,
 ) -> None:
-    """Look at a splat file in the browser, from the first camera, with the cameras and their photographs around it.
+    """Look at a splat file in the browser, from the first camera, with the cameras and their images around it.
 
-    With --images only the cameras of these photographs are drawn. A click at a camera leads there (not in an .html).
+    With --images only the cameras of these images are shown. A click at a camera leads there (not in an .html).
     Nothing is fetched from the network.
     """
     from ..splats.io import read_splats
@@ -80,7 +78,7 @@ def view(
 
 
 def main() -> None:
-    """Entry point of idesplat-view."""
+    """Run the command."""
     run(view)
 
 
@@ -104,7 +102,7 @@ def _check_page(html: Path, scene: Path, cameras: Path | None, images: list[Path
     run = outputs()
     run.reads("the scene", [scene])
     run.reads("the cameras", camera_files(cameras) if cameras else [])
-    run.reads("a photograph", given_images(images))
+    run.reads("an image", given_images(images))
     run.writes("--html", [html])
 
 
@@ -118,7 +116,7 @@ def _relative(viewpoints: "list[Viewpoint]", scene: Path) -> "list[Viewpoint]":
 
 
 def read_viewpoints(cameras: Path | None, form: CameraFormat | None, images: list[Path]) -> "list[Viewpoint]":
-    """The cameras of the photographs, with these, without distortion; all cameras where there are no photographs.
+    """The cameras of the images, with these, without distortion; all cameras where there are no images.
 
     Raises InputError for what cannot be read, or does not belong together.
     """
@@ -141,19 +139,19 @@ def read_viewpoints(cameras: Path | None, form: CameraFormat | None, images: lis
     with scratch_folder() as folder:
         files = find_input_images(images, cameras, form, folder)
         pairs = match_images_to_cameras(files, read_cameras(cameras, files, form))
-        return [_viewpoint(file, camera) for file, camera in progress(pairs, "reading photographs")]
+        return [_viewpoint(file, camera) for file, camera in progress(pairs, "reading images")]
 
 
 def _viewpoint(file: Path, camera: "Camera") -> "Viewpoint":
-    """A camera with its photograph, without distortion."""
+    """A camera with its image, without distortion."""
     from ..cameras.camera import resize_camera
     from ..cameras.undistortion import undistort
     from ..errors import error_context
     from ..images.io import load_image
     from ..viewer.viser_scene import Viewpoint
 
-    photograph = load_image(file)
+    image = load_image(file)
     with error_context(str(file)):
-        camera = resize_camera(camera, photograph.shape[1], photograph.shape[0])
-    photograph, camera = undistort(photograph, camera)
-    return Viewpoint(camera, photograph)
+        camera = resize_camera(camera, image.shape[1], image.shape[0])
+    image, camera = undistort(image, camera)
+    return Viewpoint(camera, image)

@@ -1,19 +1,22 @@
-"""What idesplat-infer is given, brought together: photographs or a video, their cameras or none, views and size."""
+"""What a reconstruction is made from: images or a video, their cameras or none, the views chosen of them."""
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from ..cameras.camera import Camera
+from ..cameras.discovery import find_cameras
 from ..cameras.formats import ESTIMATE, CameraFormat
 from ..cameras.io import read_cameras
 from ..errors import InputError
+from ..images.arrays import as_uint8_image
 from ..images.io import describe_unsupported, image_stem
 from ..images.resizing import cover_crop
-from ..images.sizes import nearest_size, parse_size
+from ..images.sizes import nearest_size
+from ..sfm.estimate import describe_estimate, estimate_cameras
 from ..system.files import scratch_folder
 from ..system.progress import working
 from ..views.batch import ViewBatch, build_view_batch, match_images_to_cameras
@@ -23,108 +26,179 @@ from ..views.sources import find_input_images
 from .model_files import ModelFiles
 
 DEFAULT_VIEWS = 2
-# What --frames takes beside names and numbers: 0-3 is 0, 1, 2, 3; 0:8:2 is 0, 2, 4, 6, as Python has it.
+# What --select takes beside names and numbers: 0-3 is 0, 1, 2, 3; 0:8:2 is 0, 2, 4, 6, as Python has it.
 RANGE = re.compile(r"([0-9]{1,9})(?:-([0-9]{1,9}))?")
 SLICE = re.compile(r"([0-9]{0,9}):([0-9]{0,9})(?::([0-9]{0,9}))?")
-MUCH = 0.7  # share of a photograph below which it is said that the rest is cut off
+MIN_SHOWN_AREA = 0.7  # share of an image below which a note says that the rest is cropped
 
 
 @dataclass(frozen=True)
 class Request:
-    """What the user asked for, in the words of the options."""
+    """What is asked for; `reconstruct` has the meaning of each field."""
 
-    images: list[Path]
-    cameras: str
-    camera_format: CameraFormat | None
-    focal: str | None
-    frames: str | None
-    views: int | None
-    size: str | None
+    images: Sequence[Path | str | np.ndarray]
+    cameras: Path | str | Sequence[Camera] | None = None
+    camera_format: CameraFormat | None = None
+    focal: str | None = None
+    select: str | None = None
+    views: int | None = None
+    size: tuple[int, int] | None = None  # height, width
 
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
     """What the network takes, and how it came about.
 
-    views: the chosen photographs with their cameras. photographs: the files of all, chosen or not. cameras: those of
-    all photographs. notes: lines for the user.
+    views: the chosen images with their cameras. images: the files of all, chosen or not. cameras: those of all images.
+    source: where the cameras come from, a path, "estimate" or "given". notes: lines for the user.
     """
 
     views: ViewBatch
-    photographs: list[Path]
+    images: list[Path]
     cameras: list[Camera]
+    source: str
     notes: list[str]
+
+    @property
+    def estimated(self) -> bool:
+        """Whether the cameras were estimated."""
+        return self.source == ESTIMATE
+
+
+@dataclass
+class _PosedImages:
+    """Images with their cameras, before views are chosen of them.
+
+    wanted: how many views are to be used; None for all. files: of all images that were given.
+    """
+
+    pairs: Sequence[ImageCameraPair]
+    wanted: int | None
+    files: list[Path] = field(default_factory=list)
+    source: str = "given"
+    notes: list[str] = field(default_factory=list)
 
 
 def read_inputs(request: Request, model: ModelFiles) -> Inputs:
-    """Read photographs and cameras, or estimate these, choose the views and bring them to the model's size.
+    """Read images and cameras, or estimate these, choose the views and bring them to the model's size.
 
     Raises InputError for whatever cannot be used.
     """
-    notes = describe_unsupported(request.images)
     with scratch_folder() as folder:
-        given = None if request.cameras == ESTIMATE else Path(request.cameras)
-        photographs = images = find_input_images(request.images, given, request.camera_format, folder)
-        decoded: dict[Path, np.ndarray] = {}
-        if given is None:
-            from ..sfm.estimate import estimate_cameras
-
-            images = pick_frames(images, request.frames)
-            wanted = _wanted(request, model, images)
-            skipped: list[str] = []
-            cameras = estimate_cameras(images, request.focal, None if request.frames else skipped, decoded)
-            notes += skipped
-            notes.append(_estimated(len(images) - len(skipped), cameras))
-            images = [Path(camera.name) for camera in cameras]
-        else:
-            with working("reading cameras"):
-                cameras = read_cameras(given, images, request.camera_format)
-            images = pick_frames(images, request.frames)
-            wanted = _wanted(request, model, images)
-        pairs = match_images_to_cameras(images, cameras)
-        if request.frames is None and len(cameras) > len(pairs):
-            notes.append(f"{len(cameras) - len(pairs)} of {len(cameras)} cameras have no photograph among those given")
-        own = [camera if path.parent != folder else replace(camera, name=path.name) for path, camera in pairs]
-        height, width = parse_size(request.size) if request.size else model.size_for(own)
-        count = min(wanted or len(pairs), len(pairs))
+        posed = _posed_images(request, model, folder)
+        pairs, notes = posed.pairs, posed.notes
+        cameras = [_named_without(folder, image, camera) for image, camera in pairs]
+        height, width = request.size or model.size_for(cameras)
+        count = min(posed.wanted or len(pairs), len(pairs))
         model.check_size(max(count, MIN_VIEWS), height, width)
-        with working("choosing and reading photographs"):
-            read: list[ImageCameraPair] = [(decoded.get(path, path), camera) for path, camera in pairs]
-            views = build_view_batch(read, count, height, width, skip_damaged=request.frames is None)
+        with working("choosing and reading images"):
+            views = build_view_batch(pairs, count, height, width, skip_damaged=request.select is None)
     notes += [f"{line}; left out" for line in views.skipped]
     if request.views and request.views > len(pairs):
-        notes.append(f"--views {request.views}: all {len(pairs)} photographs used; there are no more with a camera")
-    notes += _cut(views.cameras[0], height, width, model)
+        notes.append(f"--views {request.views}: all {len(pairs)} images used; there are no more with a camera")
+    notes += _describe_crop(views.cameras[0], height, width, model)
     if views.selection_reason:
         notes.append(
-            f"{count} of {len(pairs)} photographs used: {', '.join(views.names)}; {views.selection_reason} "
-            "(--views for more, --frames to choose)"
+            f"{count} of {len(pairs)} images used: {', '.join(views.names)}; {views.selection_reason} "
+            "(--views for more, --select to choose)"
         )
-    return Inputs(views, photographs, own, notes)
+    return Inputs(views, posed.files, cameras, posed.source, notes)
 
 
-def pick_frames(images: Sequence[Path], frames: str | None) -> list[Path]:
-    """The images that --frames names, in its order: names with or without suffix, or numbers counted from 0.
+def _posed_images(request: Request, model: ModelFiles, folder: Path) -> _PosedImages:
+    """The images with their cameras, from wherever they come. folder: for the frames of a video."""
+    arrays = [image for image in request.images if isinstance(image, np.ndarray)]
+    given: Path | str | Sequence[Camera] | None = request.cameras
+    if arrays:
+        return _PosedImages(_posed_arrays(request, arrays), model.view_count(request.views, len(arrays), None))
+    items, notes = [Path(image) for image in request.images if not isinstance(image, np.ndarray)], []
+    found = None
+    if given is None:
+        found = find_cameras(items)
+        items, given = found.images, found.cameras or ESTIMATE
+        notes.append(found.note)
+    path = None if given == ESTIMATE or not isinstance(given, (str, Path)) else Path(given)
+    notes += describe_unsupported(items)
+    images = files = find_input_images(items, path, request.camera_format, folder)
+    if given == ESTIMATE:
+        posed = _with_estimated_cameras(request, model, files)
+        posed.notes[:0] = notes
+        return posed
+    if not isinstance(given, (str, Path)):
+        cameras = list(given)
+    else:
+        with working("reading cameras"):
+            cameras = read_cameras(Path(given), images, request.camera_format)
+    if found is not None and request.select is None:
+        images = _with_a_camera(images, cameras)
+        if len(images) < len(files):
+            notes.append(f"{len(files) - len(images)} of {len(files)} images have no camera in {path}; left out")
+    images = select_images(images, request.select)
+    wanted = _view_count(request, model, len(images))
+    pairs = match_images_to_cameras(images, cameras)
+    if request.select is None and len(cameras) > len(pairs):
+        notes.append(f"{len(cameras) - len(pairs)} of {len(cameras)} cameras have no image among those given")
+    return _PosedImages(pairs, wanted, files, "given" if path is None else str(given), notes)
+
+
+def _posed_arrays(request: Request, images: Sequence[np.ndarray]) -> Sequence[ImageCameraPair]:
+    """Arrays with the cameras that are given for them, one for each."""
+    cameras = request.cameras
+    if len(images) < len(request.images) or cameras is None or isinstance(cameras, (str, Path)):
+        raise InputError("images as arrays: expected all of them to be arrays, and a Camera for each")
+    if request.select is not None:
+        raise InputError(f"select {request.select}: images given as arrays have no names; give those that are wanted")
+    if len(images) != len(cameras):
+        raise InputError(f"{len(images)} images and {len(cameras)} cameras, expected one camera for each image")
+    return [(as_uint8_image(image, camera.name), camera) for image, camera in zip(images, cameras, strict=True)]
+
+
+def _with_estimated_cameras(request: Request, model: ModelFiles, files: list[Path]) -> _PosedImages:
+    """The images whose cameras could be estimated."""
+    images = select_images(files, request.select)
+    wanted = _view_count(request, model, len(images))
+    decoded: dict[Path, np.ndarray] = {}
+    skipped: list[str] = []
+    cameras = estimate_cameras(images, request.focal, None if request.select else skipped, decoded)
+    notes = [*skipped, describe_estimate(len(images) - len(skipped), cameras)]
+    pairs = match_images_to_cameras([Path(camera.name) for camera in cameras], cameras)
+    return _PosedImages([(decoded.get(path, path), camera) for path, camera in pairs], wanted, files, ESTIMATE, notes)
+
+
+def _with_a_camera(images: Sequence[Path], cameras: Sequence[Camera]) -> list[Path]:
+    """The images that a camera names; all, if none is named."""
+    named = {image_stem(PurePosixPath(camera.name.replace("\\", "/"))) for camera in cameras}
+    return [image for image in images if image_stem(image) in named] or list(images)
+
+
+def _named_without(folder: Path, image: Path | np.ndarray, camera: Camera) -> Camera:
+    """The camera; of a video's frame, which lies in `folder` for a while, named without that folder."""
+    path = image if isinstance(image, Path) else Path(camera.name)
+    return replace(camera, name=path.name) if path.parent == folder else camera
+
+
+def select_images(images: Sequence[Path], select: str | None) -> list[Path]:
+    """The images that --select names, in its order: names with or without suffix, or numbers counted from 0.
 
     Ranges of numbers are first-last, and start:stop:step without the stop. What is the name of an image is that image.
     Raises InputError for what is none of the images.
     """
-    if frames is None:
+    if select is None:
         return list(images)
-    picked = []
-    for word in (word.strip() for word in frames.split(",")):
+    selected = []
+    for word in (word.strip() for word in select.split(",")):
         named = [image for image in images if word in (image.name, image_stem(image))]
         chosen = named or [images[number] for number in _numbers(word, len(images))]
         if len(named) > 1 or not chosen:
             problem = f"{len(named)} of the {len(images)} images are called so" if named else "no image is called so"
             raise InputError(
-                f"--frames {word}: {problem}; expected names such as {images[0].name}, or numbers from 0 to "
+                f"--select {word}: {problem}; expected names such as {images[0].name}, or numbers from 0 to "
                 f"{len(images) - 1}, also as 0-3 or 0:8:2, with commas between"
             )
-        picked += chosen
-    if len(set(picked)) < len(picked):
-        raise InputError(f"--frames {frames}: names an image twice, expected each once")
-    return picked
+        selected += chosen
+    if len(set(selected)) < len(selected):
+        raise InputError(f"--select {select}: names an image twice, expected each once")
+    return selected
 
 
 def _numbers(word: str, count: int) -> Sequence[int]:
@@ -140,34 +214,18 @@ def _numbers(word: str, count: int) -> Sequence[int]:
     return numbers if numbers and numbers[-1] < count else []
 
 
-def _wanted(request: Request, model: ModelFiles, picked: Sequence[Path]) -> int | None:
-    """How many views to use of the images that --frames names; None for all."""
-    return model.view_count(request.views, len(picked) if request.frames else None, DEFAULT_VIEWS)
+def _view_count(request: Request, model: ModelFiles, images: int) -> int | None:
+    """How many views to use; None for all. Raises InputError where the model does not take as many."""
+    return model.view_count(request.views, images if request.select else None, DEFAULT_VIEWS)
 
 
-def _cut(camera: Camera, height: int, width: int, model: ModelFiles) -> list[str]:
-    """A line that tells of the part of the photographs that is cut off, where that is much, and of a size without."""
+def _describe_crop(camera: Camera, height: int, width: int, model: ModelFiles) -> list[str]:
+    """A line that tells of the part of the images that is cut off, where that is much, and of a size without."""
     crop = cover_crop(camera.width, camera.height, width, height)
     share = width * height / (crop.width * crop.height)
-    if share >= MUCH:
+    if share >= MIN_SHOWN_AREA:
         return []
     own = model.metadata
     whole = nearest_size(camera.height / camera.width, own.height * own.width, own.size_multiple)
     remedy = "" if own.fixed_size else f"; --size {whole[0]}x{whole[1]} takes in nearly all"
-    return [f"the middle {height}x{width} of each photograph is used, {100 * share:.0f} % of it{remedy}"]
-
-
-def _estimated(photographs: int, cameras: Sequence[Camera]) -> str:
-    by = "OpenCV" if photographs == MIN_VIEWS else "COLMAP's mapper"
-    left = f", {photographs - len(cameras)} could not be placed" if len(cameras) < photographs else ""
-    return (
-        f"cameras of {len(cameras)} photographs estimated by {by}{left}; the first is the world's origin, and the unit "
-        f"is the median depth of what they see, since photographs do not know their scale; {_focal_lengths(cameras)}"
-    )
-
-
-def _focal_lengths(cameras: Sequence[Camera]) -> str:
-    focals = sorted(float(camera.K[0, 0]) for camera in cameras)
-    span = dict.fromkeys(f"{focal:.0f}" for focal in (focals[0], focals[-1]))
-    first = cameras[0]
-    return f"focal length {' to '.join(span)} pixels, of photographs {first.width} wide and {first.height} high"
+    return [f"the middle {height}x{width} of each image is used, {100 * share:.0f} % of it{remedy}"]

@@ -82,6 +82,16 @@ def estimate_cameras(
         return _in_unit(*_two_cameras(*usable))
 
 
+def describe_estimate(images: int, cameras: Sequence[Camera]) -> str:
+    """A line that says how the cameras of `images` images were estimated, and what their unit is."""
+    by = "OpenCV" if images == 2 else "COLMAP's mapper"
+    left = f", {images - len(cameras)} not registered" if len(cameras) < images else ""
+    return (
+        f"cameras of {len(cameras)} images estimated by {by}{left}; the first is the world's origin, and the unit "
+        f"is the median depth of what they see, since images do not know their scale; {_focal_lengths(cameras)}"
+    )
+
+
 def _load_all(
     paths: Sequence[Path], focal: str | None, skipped: list[str], decoded: dict[Path, np.ndarray]
 ) -> list[UncalibratedImage]:
@@ -192,3 +202,10 @@ def _in_unit(cameras: Sequence[Camera], depths: np.ndarray) -> list[Camera]:
         depth_range = camera.depth_range and (camera.depth_range[0] * scale, camera.depth_range[1] * scale)
         moved.append(replace(camera, extrinsics=extrinsics, depth_range=depth_range))
     return moved
+
+
+def _focal_lengths(cameras: Sequence[Camera]) -> str:
+    focals = sorted(float(camera.K[0, 0]) for camera in cameras)
+    span = dict.fromkeys(f"{focal:.0f}" for focal in (focals[0], focals[-1]))
+    first = cameras[0]
+    return f"focal length {' to '.join(span)} pixels, of images {first.width} wide and {first.height} high"

@@ -151,7 +151,7 @@ def test_depth_alone_becomes_depth_maps_and_points_or_a_surface(given, name, cap
     assert colours[:, :3].std() > 1
     printed = capsys.readouterr().out
     assert f"wrote {name}" in printed and "wrote scene-depth: 2 depth maps" in printed
-    assert f"open {name} in MeshLab" in printed and "idesplat-render" not in printed
+    assert f"open {name} in MeshLab" in printed and "idesplat render" not in printed
 
 
 def test_depth_maps_go_where_they_are_wanted(given):

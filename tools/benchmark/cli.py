@@ -1,4 +1,4 @@
-"""The command idesplat-bench: time and memory of exported models, and where the time goes.
+"""The command `idesplat bench`: time and memory of exported models, and where the time goes.
 
 Candidates run interleaved, round by round, each in a process of its own, so transient load affects all of them equally.
 Beside them run a large GEMM, whose rate is the roofline, and the same networks in eager PyTorch where it is installed.
@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ...runtime.cli.input_files import model_files
-from ...runtime.cli.outputs import STANDARD_OUTPUT, Overwrite, guards_outputs, outputs
+from ...runtime.cli.options import Config, Json, Overwrite, Quiet, Verbose
+from ...runtime.cli.outputs import STANDARD_OUTPUT, command, outputs
 from ...runtime.cli.terminal import literal, run, say, warn
-from ...runtime.errors import InputError, exit_on_input_error
+from ...runtime.errors import InputError
 from ...runtime.images.sizes import parse_size
 from ...runtime.system.limits import parse_whole_number
 
@@ -27,8 +28,7 @@ MIN_VIEWS = 2
 STEPS_OF_A_ROUND = 3  # of training
 
 
-@exit_on_input_error
-@guards_outputs("idesplat-bench")
+@command("idesplat bench")
 def bench(
     models: Annotated[
         list[Path] | None, typer.Argument(help="Models (.onnx or staged folders) instead of the bundled one.")
@@ -46,13 +46,14 @@ def bench(
     training: Annotated[
         bool, typer.Option("--training", help="Measure training instead: scenes per second of two configurations.")
     ] = False,
-    json_path: Annotated[
-        Path | None, typer.Option("--json", help="Write everything as JSON, to standard output if it is -.")
-    ] = None,
+    json_path: Json = None,
     compare: Annotated[
         Path | None, typer.Option(help="An earlier --json file; exit with status 1 on a regression.")
     ] = None,
     overwrite: Overwrite = False,
+    config: Config = None,
+    verbose: Verbose = 0,
+    quiet: Quiet = False,
 ) -> None:
     """Measure time and memory of exported models, each in a fresh process; Ctrl-C keeps finished workloads."""
     if training:

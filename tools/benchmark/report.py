@@ -107,14 +107,14 @@ def write_rows(path: Path, machine: dict[str, Any], rows: Sequence[Row]) -> None
 def read_rows(path: Path) -> list[Row]:
     """The rows of a file that `write_rows` wrote; raises InputError."""
     try:
-        content = json.loads(read_bytes(path, "what --json of idesplat-bench wrote"))
+        content = json.loads(read_bytes(path, "what --json of idesplat bench wrote"))
         if content.get("version", 1) != VERSION and content["rows"]:
             raise InputError(f"{path}: is of an older layout of --json; measure it again with this version")
         return [Row(**entry) for entry in content["rows"]]
     except InputError:
         raise
     except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
-        raise InputError(f"{path}: not what --json of this version of idesplat-bench writes") from None
+        raise InputError(f"{path}: not what --json of this version of idesplat bench writes") from None
 
 
 def compare(rows: Sequence[Row], before: Sequence[Row]) -> list[str]:

@@ -1,4 +1,4 @@
-"""The command idesplat-eval: metrics of an exported model on held-out views."""
+"""The command `idesplat eval`: metrics of an exported model on held-out views."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ...runtime.cli.input_files import camera_files, model_files
-from ...runtime.cli.outputs import Overwrite, guards_outputs, name_files, outputs
+from ...runtime.cli.options import CAMERAS_HELP, Config, Far, Model, Near, Overwrite, Quiet, Size, Verbose
+from ...runtime.cli.outputs import command, outputs
 from ...runtime.cli.terminal import run, say, warn
-from ...runtime.errors import InputError, exit_on_input_error
+from ...runtime.errors import InputError
+from ...runtime.images.naming import name_files
 from ...runtime.images.sizes import parse_size
 from ...runtime.inference.bundled_model import bundled_model
 from .defaults import CONTEXT_VIEWS, HELD_OUT_SCENES, HOLD_OUT_EVERY, VIEW_COUNTS
@@ -23,23 +25,16 @@ if TYPE_CHECKING:  # nothing heavy is loaded before there is something to evalua
 # Scenes whose strips `chunks` and `procedural` write.
 SCENES_WITH_STRIPS = 8
 
-Out = Annotated[Path, typer.Option(help="Folder for results.json and images.", show_default=False)]
-Model = Annotated[
-    Path | None, typer.Option(help="A .onnx or staged folder of idesplat-export instead of the bundled model.")
-]
-Size = Annotated[str | None, typer.Option(help="HEIGHTxWIDTH to work at instead of the trained size.")]
-Near = Annotated[float | None, typer.Option(help="Nearest depth in scene units.")]
-Far = Annotated[float | None, typer.Option(help="Farthest depth in scene units.")]
+Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for results.json and images.", show_default=False)]
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, help=__doc__)
 
 
 @app.command()
-@exit_on_input_error
-@guards_outputs("idesplat-eval")
+@command("idesplat eval scene")
 def scene(
     images: Annotated[Path, typer.Argument(help="Folder of images.", show_default=False)],
-    cameras: Annotated[Path, typer.Option(help="Their cameras, such as a transforms.json.", show_default=False)],
+    cameras: Annotated[Path, typer.Option("--cameras", "-c", help=CAMERAS_HELP, show_default=False)],
     out: Out,
     model: Model = None,
     context: Annotated[list[str] | None, typer.Option(help="An image to infer from; give two or more.")] = None,
@@ -55,6 +50,9 @@ def scene(
     near: Near = None,
     far: Far = None,
     overwrite: Overwrite = False,
+    config: Config = None,
+    verbose: Verbose = 0,
+    quiet: Quiet = False,
 ) -> None:
     """Evaluate on images with cameras: hold some out, infer from others, and compare."""
     if views is not None and context:
@@ -89,8 +87,7 @@ def scene(
 
 
 @app.command()
-@exit_on_input_error
-@guards_outputs("idesplat-eval")
+@command("idesplat eval chunks")
 def chunks(
     folder: Annotated[Path, typer.Argument(help="Folder of .torch chunks.", show_default=False)],
     index: Annotated[Path, typer.Option(help="The published evaluation index (.json).", show_default=False)],
@@ -99,6 +96,9 @@ def chunks(
     near: Near = None,
     far: Far = None,
     overwrite: Overwrite = False,
+    config: Config = None,
+    verbose: Verbose = 0,
+    quiet: Quiet = False,
 ) -> None:
     """Evaluate on RealEstate10K, ACID or DL3DV as the papers do: pixelSplat's chunks, a published index of frames."""
     from .chunks import find_chunks, read_index
@@ -117,8 +117,7 @@ def chunks(
 
 
 @app.command()
-@exit_on_input_error
-@guards_outputs("idesplat-eval")
+@command("idesplat eval procedural")
 def procedural(
     out: Out,
     model: Model = None,
@@ -132,6 +131,9 @@ def procedural(
     ] = None,
     size: Size = None,
     overwrite: Overwrite = False,
+    config: Config = None,
+    verbose: Verbose = 0,
+    quiet: Quiet = False,
 ) -> None:
     """Evaluate on the held-out synthetic scenes: depth against the truth, and novel views (extra `eval`)."""
     from .evaluate import evaluate_synthetic
@@ -152,8 +154,7 @@ def procedural(
 
 
 @app.command()
-@exit_on_input_error
-@guards_outputs("idesplat-eval")
+@command("idesplat eval captures")
 def captures(
     out: Out,
     checkouts: Annotated[
@@ -167,6 +168,9 @@ def captures(
     model: Model = None,
     size: Size = None,
     overwrite: Overwrite = False,
+    config: Config = None,
+    verbose: Verbose = 0,
+    quiet: Quiet = False,
 ) -> None:
     """Evaluate on real captures at pinned commits of public repositories, cloned where they are not given (git)."""
     from ...runtime.images.png import save_png
@@ -193,7 +197,7 @@ def captures(
 
 
 def main() -> None:
-    """Entry point of idesplat-eval."""
+    """Entry point of idesplat eval."""
     run(app)
 
 

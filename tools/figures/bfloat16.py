@@ -15,7 +15,6 @@ from rich.console import Console
 from rich.table import Table
 
 from ...runtime.cli.terminal import run
-from ...runtime.errors import exit_on_input_error
 from ...runtime.inference.bundled_model import bundled_model
 from ...runtime.inference.model_files import read_model
 from ...runtime.inference.session import open_session, run_session
@@ -27,7 +26,6 @@ MATMULS = ("MatMul", "Conv", "ConvTranspose")
 VIEWS = 2
 
 
-@exit_on_input_error
 def main(
     model: Annotated[Path | None, typer.Argument(help="A .onnx file instead of the bundled model.")] = None,
     scenes: Annotated[int, typer.Option(help="Held-out synthetic scenes to measure on.", min=1)] = 3,

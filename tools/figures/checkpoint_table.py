@@ -25,7 +25,7 @@ from ...export.pipeline import export_checkpoint
 from ...model.common.network import Network
 from ...model.registry import PRESETS, build, family_of
 from ...runtime.cli.terminal import run, say
-from ...runtime.errors import InputError, exit_on_input_error
+from ...runtime.errors import InputError
 from ...runtime.inference.normalization import SceneNormalization
 from ...runtime.inference.session import CPU
 from ..benchmark.runner import thread_environment
@@ -82,7 +82,6 @@ class Measured:
     export_peak_bytes: int
 
 
-@exit_on_input_error
 def table(
     presets: Annotated[
         list[str] | None, typer.Argument(help="Presets instead of all released ones.", show_default=False)

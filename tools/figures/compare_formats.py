@@ -12,7 +12,6 @@ import numpy as np
 import typer
 
 from ...runtime.cli.terminal import run, say
-from ...runtime.errors import exit_on_input_error
 from ...runtime.geometry.intrinsics import intrinsic_matrix
 from ...runtime.rendering.render import render_view
 from ...runtime.splats.gaussians import Gaussians
@@ -48,7 +47,6 @@ def example_scene(gaussians: int) -> Gaussians:
     return Gaussians(**{name: values.astype(np.float32) for name, values in arrays.items()})
 
 
-@exit_on_input_error
 def compare(gaussians: Annotated[int, typer.Option(help="How many.", min=100)] = 131_072) -> None:
     """Print for each format CPU seconds to write and read, megabytes, and PSNR of a render after reading it back."""
     scene = example_scene(gaussians)

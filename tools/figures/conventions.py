@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from ...runtime.errors import exit_on_input_error
 from ...runtime.geometry.sh import sh_basis
 from ...runtime.system.files import atomic_write
 
@@ -140,7 +139,6 @@ FIGURES = {
 }
 
 
-@exit_on_input_error
 def conventions(folder: Annotated[Path, typer.Argument(help="Folder for the figures.", show_default=False)]) -> None:
     """Write the figures of docs/conventions.md."""
     import matplotlib

@@ -9,14 +9,13 @@ from typing import Annotated
 import typer
 
 from ...runtime.cli.infer import infer
-from ...runtime.cli.outputs import Overwrite, guards_outputs, outputs
+from ...runtime.cli.options import Overwrite
+from ...runtime.cli.outputs import command, outputs
 from ...runtime.cli.terminal import run
-from ...runtime.errors import exit_on_input_error
 from ..synthetic.make_scene import make_scene
 
 
-@exit_on_input_error
-@guards_outputs("demo")
+@command("demo")
 def demo(
     out: Annotated[Path, typer.Argument(help="Folder for everything.")] = Path("demo"), overwrite: Overwrite = False
 ) -> None:

@@ -11,7 +11,6 @@ import typer
 
 from ...runtime.cameras.io import read_cameras
 from ...runtime.cli.terminal import run, say
-from ...runtime.errors import exit_on_input_error
 from ...runtime.geometry.intrinsics import denormalize_intrinsics
 from ...runtime.images.colormaps import colormap_depth
 from ...runtime.images.png import save_png
@@ -23,7 +22,6 @@ from ...runtime.views.batch import build_view_batch
 CONTEXT, HELD_OUT = (1, 3), 2
 
 
-@exit_on_input_error
 def image(
     scene: Annotated[Path, typer.Argument(help="Folder that make_scene wrote.", show_default=False)],
     out: Annotated[Path, typer.Argument(help="The .png to write.", show_default=False)],

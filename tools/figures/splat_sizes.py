@@ -15,7 +15,6 @@ from rich.console import Console
 from rich.table import Table
 
 from ...runtime.cli.terminal import run
-from ...runtime.errors import exit_on_input_error
 from ...runtime.inference.bundled_model import bundled_model
 from ...runtime.inference.predictor import Predictor
 from ...runtime.splats.gaussians import Gaussians
@@ -32,7 +31,6 @@ VIEWS, TARGETS = 2, 2
 OWN = "model"
 
 
-@exit_on_input_error
 def main(
     model: Annotated[Path | None, typer.Argument(help="A .onnx file instead of the bundled model.")] = None,
     scenes: Annotated[int, typer.Option(help="Held-out synthetic scenes.", min=1)] = 24,

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from ...runtime.cli.outputs import Overwrite, guards_outputs, outputs
+from ...runtime.cli.options import Overwrite
+from ...runtime.cli.outputs import command, outputs
 from ...runtime.cli.terminal import run, say
-from ...runtime.errors import exit_on_input_error
 from ...runtime.system.files import atomic_write
 
 if TYPE_CHECKING:  # for a fast start: the ray caster is loaded when it is needed
@@ -35,8 +35,7 @@ CLEARANCE = 0.3  # least depth in view, relative to the median depth
 LAMP = 0.3  # half length of the lamp that casts shadows, in metres
 
 
-@exit_on_input_error
-@guards_outputs("make_scene")
+@command("make_scene")
 def make_scene(
     out_dir: Annotated[Path, typer.Argument(help="Folder to write to.", show_default=False)],
     seed: Annotated[int, typer.Option(help="Random seed of the room.", min=0)] = SEED,

@@ -8,9 +8,10 @@ from typing import Annotated, Any
 
 import typer
 
-from ...runtime.cli.outputs import Overwrite, guards_outputs, outputs
+from ...runtime.cli.options import Config, Overwrite, Quiet, Verbose
+from ...runtime.cli.outputs import command, outputs
 from ...runtime.cli.terminal import run, say, warn
-from ...runtime.errors import InputError, exit_on_input_error
+from ...runtime.errors import InputError
 from .options import Objective, Part, PerceptualKind, Precision
 from .run_files import CHECKPOINT, CURVES, LOG, PREDICTIONS
 
@@ -19,8 +20,7 @@ SECONDS_PER_MINUTE = 60
 SHOWN = {"loss": "loss", "abs_rel": "AbsRel", "psnr": "PSNR"}
 
 
-@exit_on_input_error
-@guards_outputs("idesplat-train")
+@command("idesplat train")
 def train(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the run; a run in it is resumed.")],
     preset: Annotated[str, typer.Option(help="The network: an IDESplat preset.")] = "idesplat-tiny",
@@ -77,6 +77,9 @@ def train(
     save_every: Annotated[float, typer.Option(help="Minutes between checkpoints.", min=0)] = 3.0,
     validate_every: Annotated[int, typer.Option(help="Steps between validations.", min=1)] = 200,
     overwrite: Overwrite = False,
+    config_file: Config = None,
+    verbose: Verbose = 0,
+    quiet: Quiet = False,
 ) -> None:
     """Train IDESplat on synthetic scenes with exact depth and cameras, or on captures."""
     from .settings import TrainingSettings, network_config

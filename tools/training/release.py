@@ -13,16 +13,14 @@ import typer
 
 from ...export.pipeline import export_checkpoint
 from ...runtime.cli.terminal import run
-from ...runtime.errors import exit_on_input_error
 from ...runtime.inference.bundled_model import CHECKSUM_SUFFIX, FOLDER, NAME
 from ...runtime.system.files import atomic_write, make_folder
 
 PRESET = "idesplat-tiny"
 
 
-@exit_on_input_error
 def release_bundled_model(
-    checkpoint: Annotated[Path, typer.Argument(help="What idesplat-train wrote.", show_default=False)],
+    checkpoint: Annotated[Path, typer.Argument(help="What idesplat train wrote.", show_default=False)],
     preset: Annotated[str, typer.Option(help="The network.")] = PRESET,
 ) -> None:
     """Export a checkpoint as the bundled model."""

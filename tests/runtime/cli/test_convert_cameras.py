@@ -1,4 +1,4 @@
-"""The command idesplat-cameras: what it reads it writes, or it says in one line why not."""
+"""The command `idesplat cameras`: what it reads it writes, or it says in one line why not."""
 
 import json
 from pathlib import Path

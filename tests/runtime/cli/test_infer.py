@@ -1,4 +1,4 @@
-"""The command idesplat-infer, as a user meets it: results, and one line for everything that is wrong."""
+"""The command `idesplat infer`, as a user meets it: results, and one line for everything that is wrong."""
 
 import json
 import shlex
@@ -15,7 +15,7 @@ from idesplat.runtime.cli.infer import main
 from idesplat.runtime.cli.outputs import Outputs
 from idesplat.runtime.cli.render import main as render_main
 from idesplat.runtime.cli.view import main as view_main
-from idesplat.runtime.inference.inputs import pick_frames
+from idesplat.runtime.inference.inputs import select_images
 from idesplat.runtime.splats.formats.ply import read_ply
 from idesplat.runtime.splats.io import read_splats
 from idesplat.runtime.system.files import atomic_write
@@ -48,7 +48,7 @@ def test_everything_it_can_write(workplace, scene, capsys):
     true_depth = np.stack([np.load(path)["depth"] for path in (scene / "depth").iterdir()])
     assert 0.3 * true_depth.min() < summary["near"] < np.median(true_depth) < summary["far"] < 4 * true_depth.max()
     assert "points matched between the photographs" in summary["near_far_from"]
-    assert "3 of 5 photographs used" in summary["notes"][0] and "degrees apart" in summary["notes"][0]
+    assert "3 of 5 images used" in summary["notes"][0] and "degrees apart" in summary["notes"][0]
     depths = sorted(Path("depth").glob("*.npz"))
     assert len(depths) == len(list(Path("depth").glob("*.png"))) == 3
     with np.load(depths[0]) as file:
@@ -68,9 +68,9 @@ def test_everything_it_can_write(workplace, scene, capsys):
     for text in (
         "wrote scene.ply",
         "wrote summary.json",
-        "3 of 5 photographs",
-        "idesplat-view scene.ply",
-        "idesplat-render scene.ply",
+        "3 of 5 images",
+        "idesplat view scene.ply",
+        "idesplat render scene.ply",
         "wrote depth: 3 depth maps",
         "wrote views: 3 views and 24 frames",
         "total",
@@ -89,8 +89,8 @@ def test_commands_to_copy_work_in_folders_with_spaces(workplace, capsys):
     printed = capsys.readouterr().out
     view, render = (shlex.split(line) for line in printed.splitlines() if line.startswith("    "))
     cameras = ["--cameras", "my cameras", "--camera-format", "transforms"]
-    assert view == ["idesplat-view", "my scene.ply", *cameras, "--images", "my photographs"]
-    assert render == ["idesplat-render", "my scene.ply", *cameras, "--out", "DIR"]
+    assert view == ["idesplat", "view", "my scene.ply", *cameras, "--images", "my photographs"]
+    assert render == ["idesplat", "render", "my scene.ply", *cameras, "--out", "DIR"]
     assert run_command(render_main, *render[1:]) == 0
     assert run_command(view_main, *view[1:], "--html", "page.html") == 0
 
@@ -98,15 +98,15 @@ def test_commands_to_copy_work_in_folders_with_spaces(workplace, capsys):
 def test_what_is_not_used_is_said(workplace, capsys, monkeypatch):
     assert run_command(main, *USUAL, "--views", "9") == 0
     printed = capsys.readouterr()
-    assert "--views 9: all 5 photographs used" in printed.out
-    assert "of each photograph is used" not in printed.out  # nearly all is
+    assert "--views 9: all 5 images used" in printed.out
+    assert "of each image is used" not in printed.out  # nearly all is
     assert printed.err == ""  # where that is no terminal
     monkeypatch.setenv("FORCE_COLOR", "1")
-    assert run_command(main, *USUAL, "--size", "128x64", "--frames", "0,1") == 0
+    assert run_command(main, *USUAL, "--size", "128x64", "--select", "0,1") == 0
     # of 128 x 96 pixels, at a trained size of 96 x 64
     printed = capsys.readouterr()
-    assert "the middle 128x64 of each photograph is used, 37 % of it; --size " in printed.out
-    for doing in ("reading cameras", "choosing and reading photographs", "finding near and far", "predicting"):
+    assert "the middle 128x64 of each image is used, 37 % of it; --size " in printed.out
+    for doing in ("reading cameras", "choosing and reading images", "finding near and far", "predicting"):
         assert doing in printed.err
 
 
@@ -152,12 +152,12 @@ def test_what_it_writes_can_be_rendered(workplace):
 
 
 def test_chosen_frames_and_cameras_written(workplace, capsys):
-    assert run_command(main, *USUAL, "--frames", "003,1", "--save-cameras", "used.json", "--json", "s.json") == 0
+    assert run_command(main, *USUAL, "--select", "003,1", "--save-cameras", "used.json", "--json", "s.json") == 0
     assert json.loads(Path("s.json").read_text())["views"] == ["003.png", "001.png"]
     known = {camera.name: camera for camera in read_cameras(Path("transforms.json"))}
     for camera in read_cameras(Path("used.json")):
         np.testing.assert_allclose(camera.extrinsics, known[camera.name].extrinsics, atol=1e-12)
-    assert "photographs used" not in capsys.readouterr().out
+    assert "images used" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -175,7 +175,7 @@ def test_chosen_frames_and_cameras_written(workplace, capsys):
 )
 def test_frames_by_range(frames, numbers):
     images = [Path(name) for name in ("a.png", "b.png", "c.png", "d.png", "e.png", "1-2.png", "r_0.5", "r_0.7")]
-    assert pick_frames(images, frames) == [images[number] for number in numbers]
+    assert select_images(images, frames) == [images[number] for number in numbers]
 
 
 def test_images_of_the_same_name_are_told_apart(workplace):
@@ -205,7 +205,7 @@ def test_the_summary_on_standard_output(workplace, capsys):
 
 
 def test_cameras_of_another_format_give_the_same(workplace):
-    given = (*USUAL, "--frames", "0,2", "--near", "1", "--far", "20")
+    given = (*USUAL, "--select", "0,2", "--near", "1", "--far", "20")
     assert run_command(main, *given) == 0
     expected = read_ply(Path("scene.ply"))
     known = {camera.name: camera for camera in read_cameras(Path("transforms.json"))}
@@ -229,14 +229,14 @@ def test_photographs_alone(workplace, tmp_path_factory, capsys):
     given = ("--images", folder / "images", "--model", "model.onnx", "--out", "scene.ply", "--cameras", "estimate")
     assert run_command(main, *given, "--focal", focal, "--save-cameras", "found.json") == 0
     printed = capsys.readouterr().out
-    assert "cameras of 2 photographs estimated by OpenCV" in printed and "unit is the median depth" in printed
+    assert "cameras of 2 images estimated by OpenCV" in printed and "unit is the median depth" in printed
     assert "what the cameras are known to see" in printed and "--cameras found.json" in printed
     assert len(read_ply(Path("scene.ply"))) == 2 * 64 * 96
     assert run_command(render_main, "scene.ply", "--cameras", "found.json", "--out", "drawn") == 0
     assert run_command(main, *given, "--focal", focal) == 0
     printed = capsys.readouterr().out
-    assert "wrote scene.cameras.json" in printed and "idesplat-view scene.ply --cameras scene.cameras.json" in printed
-    assert f"focal length {float(focal):.0f} pixels, of photographs 320 wide and 240 high" in printed
+    assert "wrote scene.cameras.json" in printed and "idesplat view scene.ply --cameras scene.cameras.json" in printed
+    assert f"focal length {float(focal):.0f} pixels, of images 320 wide and 240 high" in printed
     names = [camera.name for camera in read_cameras(Path("scene.cameras.json"))]
     assert [Path(name).resolve() for name in names] == sorted((folder / "images").iterdir())  # as seen from the file
     Path("scene.ply").unlink()
@@ -250,7 +250,7 @@ def test_a_video_with_cameras_that_name_its_frames(workplace):
         video.write(cv2.imread(str(path)))
     video.release()
     change_cameras(lambda c: [frame.update(file_path=f"clip-{i:06}.png") for i, frame in enumerate(c["frames"])])()
-    assert run_command(main, *USUAL[2:], "--images", "clip.avi", "--frames", "0,4", "--save-cameras", "used.json") == 0
+    assert run_command(main, *USUAL[2:], "--images", "clip.avi", "--select", "0,4", "--save-cameras", "used.json") == 0
     assert [camera.name for camera in read_cameras(Path("used.json"))] == ["clip-000000.png", "clip-000004.png"]
 
 
@@ -274,8 +274,8 @@ def without_fields(content, *names):
 
 BAD = {
     "missing image folder": (nothing, ("--images", "nowhere"), "nowhere"),
-    "unreadable image": (lambda: Path("images/000.png").write_bytes(b"not a picture"), ("--frames", "0,1"), "000.png"),
-    "empty image": (lambda: Path("images/000.png").write_bytes(b""), ("--frames", "0,1"), "000.png"),
+    "unreadable image": (lambda: Path("images/000.png").write_bytes(b"not a picture"), ("--select", "0,1"), "000.png"),
+    "empty image": (lambda: Path("images/000.png").write_bytes(b""), ("--select", "0,1"), "000.png"),
     "corrupt JSON": (lambda: Path("transforms.json").write_text('{"frames": ['), (), "transforms.json"),
     "missing cameras": (nothing, ("--cameras", "none.json"), "none.json"),
     "missing pose": (change_cameras(lambda c: c["frames"][0].pop("transform_matrix")), (), "transform_matrix"),
@@ -300,9 +300,9 @@ BAD = {
         "camera",
     ),
     "more images than cameras": (change_cameras(lambda c: c["frames"].pop()), (), "004"),
-    "a frame that is not there": (nothing, ("--frames", "000,9"), "--frames 9: no image is called so"),
-    "a frame twice": (nothing, ("--frames", "000,0"), "names an image twice"),
-    "too few frames": (nothing, ("--frames", "2"), "expected at least 2"),
+    "a frame that is not there": (nothing, ("--select", "000,9"), "--select 9: no image is called so"),
+    "a frame twice": (nothing, ("--select", "000,0"), "names an image twice"),
+    "too few frames": (nothing, ("--select", "2"), "expected at least 2"),
     "a video that is none": (lambda: Path("a.mp4").write_bytes(b"hello"), ("--images", "a.mp4"), "a.mp4"),
     "cameras of another format": (nothing, ("--camera-format", "colmap"), "COLMAP"),
     "a size it cannot take": (nothing, ("--size", "64x50"), "multiples of 16"),
@@ -316,12 +316,12 @@ BAD = {
     "a provider that is not installed": (nothing, ("--provider", "CUDA"), "CUDA"),
     "an output folder that nobody may write to": (nothing, ("--out", "/proc/scene.ply"), "cannot write into /proc"),
     "an output folder that nobody may make": (nothing, ("--out", "/proc/a/b.ply"), "cannot write into /proc"),
-    "a range beyond the images": (nothing, ("--frames", "0-5"), "--frames 0-5: no image is called so"),
-    "a range that ends before it begins": (nothing, ("--frames", "3-1"), "--frames 3-1: no image is called so"),
-    "a slice beyond the images": (nothing, ("--frames", "0:9"), "--frames 0:9: no image is called so"),
-    "a slice without steps": (nothing, ("--frames", "0:4:0"), "--frames 0:4:0: no image is called so"),
-    "a number that is none": (nothing, ("--frames", "²,³"), "--frames ²: no image is called so"),
-    "a number of too many digits": (nothing, ("--frames", "9" * 5000), "no image is called so"),
+    "a range beyond the images": (nothing, ("--select", "0-5"), "--select 0-5: no image is called so"),
+    "a range that ends before it begins": (nothing, ("--select", "3-1"), "--select 3-1: no image is called so"),
+    "a slice beyond the images": (nothing, ("--select", "0:9"), "--select 0:9: no image is called so"),
+    "a slice without steps": (nothing, ("--select", "0:4:0"), "--select 0:4:0: no image is called so"),
+    "a number that is none": (nothing, ("--select", "²,³"), "--select ²: no image is called so"),
+    "a number of too many digits": (nothing, ("--select", "9" * 5000), "no image is called so"),
     "a share that is none": (nothing, ("--min-opacity", "2"), "--min-opacity 2"),
     "a surface without faint splats": (
         nothing,

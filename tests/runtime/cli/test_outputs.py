@@ -13,10 +13,11 @@ from idesplat.runtime.cameras.io import write_cameras
 from idesplat.runtime.cli.cameras import main as cameras_main
 from idesplat.runtime.cli.convert import main as convert
 from idesplat.runtime.cli.infer import main as infer
-from idesplat.runtime.cli.outputs import Outputs, name_files, outputs, write_json
+from idesplat.runtime.cli.outputs import Outputs, outputs, write_json
 from idesplat.runtime.cli.render import main as render
 from idesplat.runtime.cli.view import main as view
 from idesplat.runtime.errors import InputError
+from idesplat.runtime.images.naming import name_files
 from idesplat.runtime.system.files import atomic_write
 from idesplat.runtime.system.output_records import LEAST_STALE_LINES, read_record
 from scene_files import pinholes, snapshot, write_scene
@@ -49,7 +50,7 @@ def refused(capfd, folder, main, *arguments):
     return lines[0]
 
 
-# ---- idesplat-render: seven ways to say where the photographs are
+# ---- idesplat render: seven ways to say where the photographs are
 
 
 def as_folder(dataset):
@@ -121,7 +122,7 @@ def test_render_never_replaces_photographs(dataset, capfd, way, overwrite):
         return  # nothing says where these photographs are, and the user wants to replace them
     options = ["--overwrite"] if overwrite else []
     line = refused(capfd, dataset, render, "scene.ply", "--cameras", cameras, "--out", out, "--depth", *options)
-    assert "would replace a photograph" in line or (not overwrite and "idesplat did not write it" in line)
+    assert "would replace an image" in line or (not overwrite and "idesplat did not write it" in line)
 
 
 def test_render_never_replaces_a_named_picture(dataset, capfd):
@@ -161,7 +162,7 @@ USUAL = {"--images": "images", "--cameras": "transforms.json", "--model": "model
 INFERS = {
     "depth maps over photographs": (
         {"--save-depth": "images", "--near": "1", "--far": "9"},
-        "would replace a photograph",
+        "would replace an image",
     ),
     "summary over cameras": ({"--json": "transforms.json"}, "would replace the cameras"),
     "report over cameras": ({"--report": "./images/../transforms.json"}, "would replace the cameras"),
@@ -169,7 +170,7 @@ INFERS = {
     "splats over the model": ({"--model": "model.ply", "--out": "model.ply"}, "would replace the model"),
     "summary over splats": ({"--json": "new.ply"}, "--json new.ply: is also the file of --out"),
     "summary over splats in other letters": ({"--json": "NEW.ply"}, "--json NEW.ply: is also the file of --out"),
-    "report over a photograph": ({"--report": "images/000.png"}, "would replace a photograph"),
+    "report over a photograph": ({"--report": "images/000.png"}, "would replace an image"),
     "a file where a folder is to be": ({"--save-depth": "new.ply"}, "--save-depth new.ply"),
     "a folder in a file": ({"--render": "new.ply/views"}, "new.ply is the file of --out"),
 }
@@ -189,7 +190,7 @@ def test_infer_never_replaces_what_it_reads(workplace, capfd, name, overwrite):
 def test_infer_never_replaces_photographs_that_only_the_cameras_name(dataset, capfd, way, option):
     cameras, _ = way(dataset)
     given = ["--cameras", cameras, "--out", "new.ply", "--near", "1", "--far", "9"]  # the carried model
-    assert "would replace a photograph" in refused(capfd, dataset, infer, *given, *option, "--overwrite")
+    assert "would replace an image" in refused(capfd, dataset, infer, *given, *option, "--overwrite")
 
 
 @pytest.mark.posix
@@ -367,10 +368,10 @@ def test_devices_and_impossible_names_are_refused(tmp_path, monkeypatch):
 def test_inputs_that_are_known_later(tmp_path):
     run = Outputs("test", overwrite=True)
     run.writes("--out", [tmp_path / "a.png"])
-    with pytest.raises(InputError, match=r"--out .*a\.png: would replace a photograph"):
-        run.reads("a photograph", [tmp_path / "b" / ".." / "a.png"])
-    run.reads("a photograph", [tmp_path / "b.png"])
-    with pytest.raises(InputError, match="would replace a photograph"):
+    with pytest.raises(InputError, match=r"--out .*a\.png: would replace an image"):
+        run.reads("an image", [tmp_path / "b" / ".." / "a.png"])
+    run.reads("an image", [tmp_path / "b.png"])
+    with pytest.raises(InputError, match="would replace an image"):
         run.writes("--out", [tmp_path / "b.png"])  # though neither exists
 
 

@@ -1,4 +1,4 @@
-"""Pictures out: the command idesplat-render, camera paths and PNG files."""
+"""Pictures out: the command idesplat render, camera paths and PNG files."""
 
 import json
 import subprocess
@@ -98,7 +98,7 @@ def test_draws_every_camera_at_its_own_size(
         # The inverse differs in its last bit, so that a value at a half may round the other way.
         np.testing.assert_allclose(read_rgb(out / name), np.clip(expected, 0, 1) * 255, atol=0.5 + 1e-3)
         assert str(out / name) in printed.out
-    assert "300 Gaussians drawn in 2 pictures" in printed.out
+    assert "300 Gaussians rendered in 2 images" in printed.out
     assert printed.err == ""
 
 
@@ -331,7 +331,7 @@ def test_many_pictures_are_said_in_one_line(
     write_ply(Path("scene.ply"), a_ball_of_gaussians())
     assert run(monkeypatch, "scene.ply", "--orbit", "--frames", 9, "--depth", "--size", "24x32", "--out", "out") == 0
     wrote, drawn = capsys.readouterr().out.splitlines()
-    assert wrote == "wrote 27 files in out" and drawn.endswith("drawn in 9 pictures; open out in any image viewer")
+    assert wrote == "wrote 27 files in out" and drawn.endswith("rendered in 9 images; open out in any image viewer")
     assert len(list(Path("out").iterdir())) == 27
 
 
@@ -359,8 +359,8 @@ def test_a_path_through_the_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (("--out", "out", "--orbit", "--degrees", "400"), "expected one frame, 0 to 360 degrees"),
         (("--out", "a.mp4", "--fps", "0"), "--fps 0: expected frames a second"),
         (("--out", "a.mp4", "--cameras", "cameras.json"), "a video has one size; add --size"),
-        (("--out", "a.png", "--cameras", "cameras.json"), "2 pictures do not fit one file"),
-        (("--out", "a.png", "--orbit"), "90 pictures do not fit one file"),
+        (("--out", "a.png", "--cameras", "cameras.json"), "2 images do not fit one file"),
+        (("--out", "a.png", "--orbit"), "90 images do not fit one file"),
         (("--out", "scene.ply/a.mp4"), "scene.ply is not a folder"),
         (("--out", "out", "--size", "9000x9000"), "sides of 8192 pixels at most"),
         (("--out", "out", "--orbit", "--frames", "10001"), "--frames 10001: expected 1 to 10000"),

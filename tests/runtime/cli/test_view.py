@@ -1,4 +1,4 @@
-"""The command idesplat-view in a real browser: the page, and the file to send, show what the rasteriser draws."""
+"""The command `idesplat view` in a real browser: the page, and the file to send, show what the rasteriser draws."""
 
 import subprocess
 import sys

@@ -67,7 +67,7 @@ def capture(drawn, tmp_path) -> Path:
 
 
 def request(folder: Path, *images: Path, cameras: str | None = None, **changes) -> Request:
-    options = {"camera_format": None, "focal": None, "frames": None, "views": None, "size": None, **changes}
+    options = {"camera_format": None, "focal": None, "select": None, "views": None, "size": None, **changes}
     return Request(list(images), cameras or str(folder / "transforms.json"), **options)
 
 
@@ -107,7 +107,7 @@ def test_an_image_is_decoded_once_and_only_if_it_is_used(capture, counted):
     # Three images are sampled, each with its best partner and the next one; two of these, or others, are chosen.
     assert counted["decoded"] <= VIEWS and counted["sift"] <= counted["decoded"]
     counted.clear()
-    inputs = read(capture, frames="0,3,5")
+    inputs = read(capture, select="0,3,5")
     assert counted == {"decoded": 3}
     ranged(inputs)
     assert counted == {"decoded": 3, "sift": 3}
@@ -115,7 +115,7 @@ def test_an_image_is_decoded_once_and_only_if_it_is_used(capture, counted):
 
 def test_estimating_cameras_decodes_once(large, counted):
     folder, focal = large
-    inputs = read(folder, cameras="estimate", focal=focal, frames="0,2")
+    inputs = read(folder, cameras="estimate", focal=focal, select="0,2")
     ranged(inputs)
     assert counted == {"decoded": 2, "sift": 2}
 
@@ -133,7 +133,7 @@ def test_damaged_images_are_named_and_left_out(capture):
     assert damaged and all(note.endswith("left out") for note in damaged)
     assert {Path(note.partition(":")[0]).name for note in damaged} <= set(names)
     with pytest.raises(InputError, match=f"{names[0]}: is damaged"):  # it was asked for
-        read(capture, frames=",".join(names))
+        read(capture, select=",".join(names))
 
 
 def test_too_few_undamaged_images(capture):
@@ -183,7 +183,7 @@ def test_cameras_name_their_images(capture):
     next((capture / "images").glob("*3.png")).unlink()
     assert len(named(capture / "transforms.json", capture)) == VIEWS - 1
     assert len(named(capture, capture)) == VIEWS - 1
-    assert "1 of 8 cameras have no photograph" in read_inputs(request(capture), SmallModel()).notes[0]
+    assert "1 of 8 cameras have no image" in read_inputs(request(capture), SmallModel()).notes[0]
 
 
 def test_images_beside_the_file_and_names_without_suffix(capture):

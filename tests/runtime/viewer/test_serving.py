@@ -1,4 +1,4 @@
-"""Who may connect to what idesplat-view serves, and where it is served."""
+"""Who may connect to what idesplat view serves, and where it is served."""
 
 import http.client
 import http.server

@@ -1,4 +1,4 @@
-"""The command idesplat-eval: its numbers against the library used by hand, and one line for what is wrong."""
+"""The command idesplat eval: its numbers against the library used by hand, and one line for what is wrong."""
 
 import json
 import shutil
@@ -247,7 +247,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(name: str, workplace: Path, ca
     spoil, arguments, expected = BAD[name]
     spoil()
     Path("out").mkdir()
-    with Outputs("idesplat-eval"), atomic_write(Path("out/results.json")) as temporary:
+    with Outputs("idesplat eval"), atomic_write(Path("out/results.json")) as temporary:
         temporary.write_bytes(b"the result of yesterday")
     before = {path: path.stat().st_mtime_ns for path in workplace.rglob("*")}
     assert run_command(main, *arguments) == 2

@@ -21,7 +21,7 @@ import typer
 from ....runtime.cameras.camera import Camera
 from ....runtime.cameras.io import read_cameras, write_cameras
 from ....runtime.cli.terminal import run, say
-from ....runtime.errors import InputError, exit_on_input_error
+from ....runtime.errors import InputError
 from ....runtime.geometry.quaternions import matrices_to_quaternions
 from ....runtime.images.io import SUFFIXES
 from ....runtime.sfm.estimate import estimate_cameras
@@ -40,7 +40,6 @@ MAX_EPIPOLAR_PX = 1.0  # pixels, median over a frame's matches with a neighbour
 DECIMALS = 9
 
 
-@exit_on_input_error
 def choose_captures(
     checkouts: Annotated[Path, typer.Option(help="Folder of checkouts; missing ones are cloned into it.")],
     work: Annotated[Path, typer.Option(help="Folder for images and estimated cameras, which are reused.")],

@@ -1,0 +1,161 @@
+"""The files that `idesplat infer` writes: checked before the work, written after it."""
+
+import json
+import shlex
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from ..cameras.discovery import Found
+from ..errors import InputError
+from ..inference.depth_format import DepthFormat
+from ..inference.inputs import Inputs
+from ..inference.model_files import ModelFiles
+from ..reconstruction.files import PATH_FRAMES, depth_files, render_files
+from ..reconstruction.result import Reconstruction
+from ..splats.filtering import FilterOptions
+from ..splats.io import MESH_ENDINGS, holds_splats, is_mesh, splat_suffix
+from ..splats.mesh import MAX_DEPTH_JUMP
+from ..splats.points import POINT_SUFFIXES
+from .input_files import camera_files, given_images, model_files, named_images
+from .outputs import STANDARD_OUTPUT, outputs, write_json
+from .reporting import note
+from .terminal import say
+
+# How many pixels COLMAP's fusion asks of a point unless told otherwise.
+COLMAP_MIN_PIXELS = 5
+DEPTH_FOLDER = "-depth"  # ends the name of the folder where a model that predicts depth alone is not told where to
+ESTIMATED_CAMERAS = ".cameras.json"  # ends the name of the cameras that were estimated, beside the scene
+
+
+@dataclass
+class Targets:
+    """What is to be written, by option. found: the images, and their cameras' file, if it is one."""
+
+    out: Path
+    save_depth: Path | None
+    depth_format: DepthFormat | None
+    render: Path | None
+    save_cameras: Path | None
+    report: Path | None
+    json_path: Path | None
+    found: Found
+    _written: list[Path] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        splat_suffix(self.out)
+        if self.found.cameras is None and self.save_cameras is None:
+            self.save_cameras = self._beside(ESTIMATED_CAMERAS)
+
+    def announce(self, model: Path) -> None:
+        """Announce what is read and written; raises InputError, before the work, where that does not go together."""
+        run = outputs()
+        run.reads("the model", model_files(model))
+        run.reads("an image", given_images(self.found.images))
+        if self.found.cameras is not None:
+            run.reads("the cameras", camera_files(self.found.cameras))
+        run.writes("--out", [self.out])
+        if self.json_path is not None and self.json_path != STANDARD_OUTPUT:
+            run.writes("--json", [self.json_path])
+        for option, path in {"--save-cameras": self.save_cameras, "--report": self.report}.items():
+            if path is not None:
+                run.writes(option, [path])
+        for option, folder in {"--save-depth": self.save_depth, "--render": self.render}.items():
+            if folder is not None:
+                run.writes_into(option, folder)
+
+    def check_model(self, model: ModelFiles, filters: FilterOptions) -> None:
+        """Raise InputError, before the work, unless the model makes what is asked for.
+
+        Of a model that predicts depth alone, a name that may stand for splats or points stands for points.
+        """
+        surface, gaussians = is_mesh(self.out), model.metadata.gaussians
+        needs = [f"--out {self.out}"] * (holds_splats(self.out) and splat_suffix(self.out) not in POINT_SUFFIXES)
+        needs += ["--render"] * (self.render is not None) + ["--report"] * (self.report is not None)
+        if not surface:
+            needs += [f"--{step.replace('_', '-')}" for step in filters.enabled]
+        if needs and not gaussians:
+            endings = ", ".join((*POINT_SUFFIXES, *MESH_ENDINGS))
+            raise InputError(f"{needs[0]}: {model.path} predicts depth alone; write points or a surface ({endings})")
+        if surface and set(filters.enabled) - {"max_depth_jump"}:
+            raise InputError(
+                f"--out {self.out}: of all filters a surface knows --max-depth-jump alone; leave out the rest"
+            )
+        if self.depth_format is not None and self.save_depth is None and gaussians:
+            raise InputError(f"--depth-format {self.depth_format}: give --save-depth, the folder to write to")
+        if not gaussians and self.save_depth is None:  # depth maps are what such a model is for
+            self.save_depth = self._beside(DEPTH_FOLDER)
+
+    def announce_views(self, inputs: Inputs) -> None:
+        """Announce the files that are named after views, now that these are chosen; raises InputError as `announce`."""
+        run = outputs()
+        run.reads("an image", inputs.images)
+        if self.found.cameras is not None:
+            run.reads("an image", named_images(self.found.cameras, inputs.cameras))
+        if self.save_depth is not None:
+            run.writes("--save-depth", depth_files(self.save_depth, inputs.views, self._depth_format()))
+        if self.render is not None:
+            run.writes("--render", render_files(self.render, inputs.views))
+
+    def write(self, result: Reconstruction, filters: FilterOptions, started: float) -> dict[str, float]:
+        """Write everything; seconds by step. started: when the command did, by `time.perf_counter`."""
+        writing = time.perf_counter()
+        for line in result.save(self.out, filters.max_depth_jump or MAX_DEPTH_JUMP):
+            note(f"note: {line}")
+        views, self._written = [], [self.out]
+        if self.save_depth is not None:
+            outputs().make_folder(self.save_depth)
+            views += result.save_depth(self.save_depth, self._depth_format())
+        if self.render is not None:
+            outputs().make_folder(self.render)
+            views += result.save_renders(self.render)
+        if self.save_cameras is not None:
+            result.save_cameras(self.save_cameras)
+            self._written.append(self.save_cameras)
+        now = time.perf_counter()
+        seconds = result.timings | {"write": now - writing, "total": now - started}
+        summary = result.summary([*self._written, *views], seconds)
+        summary["cleaned"]["asked"] = asdict(filters)
+        if self.report is not None:
+            result.save_report(self.report, summary)
+            self._written.append(self.report)
+            summary["files"].append(str(self.report))
+        if self.json_path is not None:
+            write_json(self.json_path, json.dumps(summary, indent=2))
+            self._written += [self.json_path] * (self.json_path != STANDARD_OUTPUT)
+        return seconds
+
+    def tell_written(self, result: Reconstruction, seconds: dict[str, float]) -> None:
+        """Say which files and folders were written."""
+        for path in self._written:
+            say(f"wrote {path}{self._described(result, seconds) if path == self.out else ''}")
+        views = len(result.views.names)
+        if self.save_depth is not None and self._depth_format() is DepthFormat.COLMAP:
+            fuse = ["colmap", "stereo_fusion", "--workspace_path", str(self.save_depth)]
+            fuse += ["--output_path", str(self.save_depth / "fused.ply")]
+            if views < COLMAP_MIN_PIXELS:
+                fuse += ["--StereoFusion.min_num_pixels", str(views)]
+            say(f"wrote {self.save_depth}: {views} depth maps as a dense workspace of COLMAP")
+            note("to fuse them into one point cloud:", "    " + shlex.join(fuse))
+        elif self.save_depth is not None:
+            say(f"wrote {self.save_depth}: {views} depth maps, as .png to look at and as .npz in the cameras' unit")
+        if self.render is not None:
+            say(f"wrote {self.render}: {views} views and {PATH_FRAMES} frames of a path through them, as .png")
+
+    def cameras_to_show(self, camera_format: str | None) -> list[str]:
+        """Options that give other commands the cameras that were given or found, or those that were kept."""
+        form = ["--camera-format", camera_format] if camera_format and self.found.cameras else []
+        return ["--cameras", str(self.found.cameras or self.save_cameras), *form]
+
+    def _described(self, result: Reconstruction, seconds: dict[str, float]) -> str:
+        """What the file of the scene holds, how large it is and how long it took, as the end of a line."""
+        splats = result.gaussians if holds_splats(self.out) else None
+        count = "" if splats is None else f"{len(splats):,} Gaussians, "
+        return f": {count}{self.out.stat().st_size / 1e6:.1f} MB, in {seconds['total']:.1f} s"
+
+    def _depth_format(self) -> DepthFormat:
+        return self.depth_format or DepthFormat.NPZ
+
+    def _beside(self, ending: str) -> Path:
+        """A path beside the scene, called like it but for the ending."""
+        return self.out.with_name(self.out.name[: -len(splat_suffix(self.out))] + ending)

@@ -1,0 +1,84 @@
+"""Options that several commands have, each with one meaning and one help text."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..cameras.formats import CameraFormat
+from .config_file import read_config
+
+
+def parse_count(text: str | int) -> int:
+    """A whole number; typer itself reads 0-1 as -1."""
+    try:
+        return int(text)
+    except ValueError:
+        raise typer.BadParameter(f"{text} is no whole number") from None
+
+
+IMAGES_HELP = "Folder, glob or files of images, or a video."
+CAMERAS_HELP = (
+    "File or folder of cameras: transforms.json, COLMAP, RealEstate10K, LLFF, DTU, OpenCV stereo, our own JSON."
+)
+
+Images = Annotated[list[Path] | None, typer.Option("--images", "-i", help=IMAGES_HELP, show_default=False)]
+# `--images a.png b.png`, as a shell expands a glob
+MoreImages = Annotated[list[Path] | None, typer.Argument(hidden=True)]
+Cameras = Annotated[
+    Path | None,
+    typer.Option(
+        "--cameras",
+        "-c",
+        help=CAMERAS_HELP,
+        show_default=False,
+    ),
+]
+CamerasFormat = Annotated[
+    CameraFormat | None, typer.Option(help="Format of the cameras, where their content does not tell it.")
+]
+Focal = Annotated[
+    str | None,
+    typer.Option(help="For estimated cameras: focal length in pixels, or on 35 mm film such as 26mm."),
+]
+Model = Annotated[
+    Path | None,
+    typer.Option(
+        "--model", "-m", help="A .onnx file or staged folder made by `idesplat export`; else the bundled model."
+    ),
+]
+Size = Annotated[
+    str | None,
+    typer.Option(help="HEIGHTxWIDTH to work at, such as 256x448; else the trained size.", show_default=False),
+]
+Near = Annotated[float | None, typer.Option(help="Nearest depth in scene units; found where not given.")]
+Far = Annotated[float | None, typer.Option(help="Farthest depth in scene units; found where not given.")]
+Json = Annotated[Path | None, typer.Option("--json", help="Write a summary as JSON, to standard output if it is -.")]
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", help="Replace existing files that idesplat did not write, too; never inputs.")
+]
+
+GENERAL = "Every command"
+Config = Annotated[
+    Path | None,
+    typer.Option(
+        "--config",
+        help="TOML file with options of this command by their names, such as `max-depth-jump = 0.05`; the command line "
+        "goes before it.",
+        callback=read_config,
+        is_eager=True,
+        rich_help_panel=GENERAL,
+    ),
+]
+Verbose = Annotated[
+    int,
+    typer.Option(
+        "--verbose",
+        "-v",
+        count=True,
+        help="Log to stderr what is done; twice: in detail.",
+        show_default=False,
+        rich_help_panel=GENERAL,
+    ),
+]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show neither progress nor notes.", rich_help_panel=GENERAL)]

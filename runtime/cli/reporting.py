@@ -1,0 +1,48 @@
+"""What a command tells while it works: notes, and its log."""
+
+import logging
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from contextvars import ContextVar
+
+from ..system.progress import reporting_to
+from .terminal import say
+
+LEVELS = (logging.WARNING, logging.INFO, logging.DEBUG)  # by how often --verbose is given
+_QUIET: ContextVar[bool] = ContextVar("_QUIET", default=False)
+
+
+@contextmanager
+def reporting(quiet: bool = False, verbose: int = 0) -> Iterator[None]:
+    """Leave out progress and notes if `quiet`; log to stderr what `verbose` asks for. Both while the block runs."""
+    token = _QUIET.set(quiet)
+    try:
+        with ExitStack() as stack:
+            if verbose:
+                stack.enter_context(_logging(LEVELS[min(verbose, len(LEVELS) - 1)]))
+            if quiet:
+                stack.enter_context(reporting_to(None))
+            yield
+    finally:
+        _QUIET.reset(token)
+
+
+def note(*lines: str) -> None:
+    """Print lines that a user can do without, unless --quiet is given."""
+    if not _QUIET.get():
+        say(*lines)
+
+
+@contextmanager
+def _logging(level: int) -> Iterator[None]:
+    """Write what our modules log to stderr."""
+    logger, handler = logging.getLogger(__name__.partition(".")[0]), logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("%(levelname)s %(name)s: %(message)s"))
+    before = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(level)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+        logger.removeHandler(handler)

@@ -1,0 +1,106 @@
+"""Images to Gaussians in one function: what `idesplat infer` does, as a library."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ..cameras.camera import Camera
+from ..cameras.formats import CameraFormat
+from ..errors import InputError
+from ..inference.bundled_model import bundled_model
+from ..inference.inputs import Inputs, Request, read_inputs
+from ..inference.model_files import ModelFiles, read_model
+from ..inference.predictor import Predictor
+from ..inference.session import CPU, provider_name
+from ..splats.filtering import FilterOptions, describe_removed, filter_gaussians
+from ..system.progress import CALLBACK, ProgressCallback, reporting_to, working
+from ..views.world_offset import apply_offset, parse_offset
+from .result import Reconstruction
+
+Images = Path | str | Sequence[Path | str | np.ndarray]
+
+
+def reconstruct(
+    images: Images,
+    cameras: Path | str | Sequence[Camera] | None = None,
+    *,
+    model: Path | str | ModelFiles | None = None,
+    camera_format: CameraFormat | str | None = None,
+    focal: str | None = None,
+    select: str | None = None,
+    views: int | None = None,
+    size: tuple[int, int] | None = None,
+    near: float | None = None,
+    far: float | None = None,
+    offset: str | None = None,
+    provider: str = CPU,
+    filters: FilterOptions | None = None,
+    on_inputs: Callable[[Inputs], None] | None = None,
+    progress: ProgressCallback | None = None,
+) -> Reconstruction:
+    """Depth and Gaussians from images, in one forward pass.
+
+    images: a folder, a glob, a video, or a sequence of image files; or arrays, RGB [h, w, 3], uint8 in 0 to 255 or
+    floating point in [0, 1], together with `cameras` as a sequence.
+    cameras: a file or folder of any known format (`camera_format` where its content does not tell it); `Camera`s, one
+    for each array, or whose names are those of the image files; "estimate"; or None for the cameras beside the images,
+    estimated where there are none (`focal`: focal length in pixels such as "1375", or on 35 mm film such as "26mm").
+    model: a .onnx file or staged folder instead of the bundled model. provider: the ONNX Runtime execution provider.
+    select: images to use, as names or numbers ("0-3", "0:8:2"). views: how many of them, by the best baselines; two by
+    default, all that `select` names. size: height and width to work at instead of the trained size.
+    near, far: bounds of depth in scene units; found from matched points or the baseline where not given.
+    offset: "auto" or "X,Y,Z", subtracted from world coordinates that float32 does not hold.
+    on_inputs: is called with the chosen views before the model is loaded; what it raises ends the reconstruction.
+    progress: is told what is being done, see `Progress` in `idesplat.runtime.system.progress`.
+    Raises InputError for whatever cannot be used.
+    """
+    _check_depth_bounds(near, far)
+    provider_name(provider)
+    filters = filters or FilterOptions()
+    parse_offset(offset or "auto")
+    with reporting_to(progress or CALLBACK.get()):
+        files = model if isinstance(model, ModelFiles) else read_model(model or bundled_model())
+        started = time.perf_counter()
+        given = [images] if isinstance(images, (str, Path)) else list(images)
+        form = CameraFormat(camera_format) if camera_format else None
+        inputs = read_inputs(Request(given, cameras, form, focal, select, views, size), files)
+        if on_inputs is not None:
+            on_inputs(inputs)
+        prepared = time.perf_counter()
+        with working("loading the model"):
+            predictor = Predictor(files, provider)
+        loaded = time.perf_counter()
+        with working("finding near and far"):
+            span = predictor.depth_range(inputs.views, near, far)
+        placed, notes = apply_offset(inputs.views, offset, span.near)
+        seconds = {"load": predictor.load_seconds, "prepare": prepared - started + time.perf_counter() - loaded}
+        with working("predicting depth and Gaussians"):
+            prediction = predictor.predict_views(placed, span.near, span.far)
+        removed: dict[str, int] = {}
+        if filters.enabled:
+            whole = prediction.need_gaussians()
+            kept, removed = filter_gaussians(whole, prediction.depth, placed.extrinsics, placed.intrinsics, filters)
+            prediction = replace(prediction, gaussians=kept)
+            notes.append(describe_removed(removed, len(kept)))
+    return Reconstruction(
+        prediction,
+        replace(inputs, views=placed),
+        files,
+        span,
+        filters,
+        removed,
+        seconds | prediction.seconds,
+        inputs.notes + notes,
+    )
+
+
+def _check_depth_bounds(near: float | None, far: float | None) -> None:
+    """What can be said of near and far before any image is read."""
+    for name, value in (("--near", near), ("--far", far)):
+        if value is not None and not 0 < value < float("inf"):
+            raise InputError(f"{name} {value:g}: expected a positive depth in scene units")
+    if near is not None and far is not None and near >= far:
+        raise InputError(f"--near {near:g} and --far {far:g}: expected near < far")
