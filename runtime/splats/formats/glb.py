@@ -1,8 +1,8 @@
-"""Gaussians as binary glTF (.glb) with KHR_gaussian_splatting, ratified by Khronos in 2026, all in float32.
+"""Gaussians as binary glTF (.glb) with the extension KHR_gaussian_splatting (Khronos, 2026), all in float32.
 
-Scales and opacities are as we have them, rotations xyzw, spherical harmonics an attribute for each coefficient. The
-frame is glTF's (x left, y up, z forward), so a scene is turned by half around z. COLOR_0 shows coloured points to
-viewers that know no splats. Nothing is lost but the length of the quaternions, which are stored as unit ones.
+Scales and opacities are those of `Gaussians`, rotations xyzw, SH one attribute for each coefficient. The axes are
+glTF's (x left, y up, z forward), a rotation by 180 degrees about z. COLOR_0 gives coloured points to viewers without
+support for splats. Nothing is lost but the length of the quaternions, which are normalised.
 """
 
 import json
@@ -29,12 +29,12 @@ JSON, BINARY = b"JSON", b"BIN\0"
 EXPECTED = "a binary glTF file with splats (.glb)"
 
 FLOATS, UNSIGNED_BYTE = {"componentType": 5126}, 5121
-# What the extension allows for its attributes, and how far normalised integers reach.
+# Component types that the extension allows, and the largest value of normalised integers.
 COMPONENTS = {5120: ("<i1", 127), 5121: ("<u1", 255), 5122: ("<i2", 32767), 5123: ("<u2", 65535), 5126: ("<f4", 1)}
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 POINTS = 0
-# What a node may say without moving anything.
-STANDING_STILL = {
+# Transformations of a node that are the identity.
+IDENTITY_TRANSFORMS = {
     "matrix": np.eye(4).ravel().tolist(),
     "rotation": [0, 0, 0, 1],
     "scale": [1, 1, 1],
@@ -44,7 +44,7 @@ ARRAY_BUFFER = 34962
 
 
 def write_glb(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None) -> list[str]:
-    """Write Gaussians as a .glb; the file appears whole or not at all.
+    """Write Gaussians as a .glb; the file is replaced atomically.
 
     offset: what was subtracted from the world coordinates, [3], in the scene's own axes, which the extras of the node
     record: as its translation it would be rounded to float32.
@@ -54,17 +54,17 @@ def write_glb(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None
     check_ranges(path, gaussians)
     check_finite(path, gaussians)
     if not len(gaussians):
-        raise InputError(f"cannot write {path}: there are no Gaussians, and glTF knows nothing empty; write a .ply")
-    turned = convert_axes(gaussians, GLTF)
+        raise InputError(f"cannot write {path}: there are no Gaussians, and glTF has no empty accessors; write a .ply")
+    converted = convert_axes(gaussians, GLTF)
     attributes = {
-        "POSITION": turned.means,
-        "COLOR_0": to_uint8(np.column_stack([srgb_to_linear(turned.colours), turned.opacities])),
-        PREFIX + "ROTATION": np.roll(normalize_quaternions(turned.quats), -1, axis=1),
-        PREFIX + "SCALE": turned.scales,
-        PREFIX + "OPACITY": turned.opacities,
+        "POSITION": converted.means,
+        "COLOR_0": to_uint8(np.column_stack([srgb_to_linear(converted.colours), converted.opacities])),
+        PREFIX + "ROTATION": np.roll(normalize_quaternions(converted.quats), -1, axis=1),
+        PREFIX + "SCALE": converted.scales,
+        PREFIX + "OPACITY": converted.opacities,
     }
-    names = _coefficients(turned.sh_degree)
-    attributes |= {name: turned.sh[:, index] for index, name in enumerate(names)}
+    names = _coefficients(converted.sh_degree)
+    attributes |= {name: converted.sh[:, index] for index, name in enumerate(names)}
     content = _document(attributes)
     if offset is not None and offset.any():
         content["nodes"][0]["extras"] = {OFFSET: offset.tolist()}
@@ -80,16 +80,14 @@ def write_glb(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None
 
 
 def read_glb(path: Path) -> Gaussians:
-    """Read a .glb with one cloud of splats; raises InputError if the file cannot be read, has none, or is damaged."""
+    """Read a .glb with one primitive of splats; raises InputError if it cannot be read, has none, or is damaged."""
     document, binary = _chunks(path, read_bytes(path, EXPECTED))
     try:
         gaussians = _read_gaussians(path, document, binary)
     except InputError:
         raise
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise_input_error(
-            path, f"not glTF as it should be ({type(error).__name__}: {str(error)[:60]})", "write it again"
-        )
+        raise_input_error(path, f"invalid glTF ({type(error).__name__}: {str(error)[:60]})", "write it again")
     check_finite(path, gaussians)
     if (gaussians.scales < 0).any() or ((gaussians.opacities < 0) | (gaussians.opacities > 1)).any():
         raise_input_error(path, "negative scales, or opacities outside 0 to 1", "write it again")
@@ -97,7 +95,7 @@ def read_glb(path: Path) -> Gaussians:
 
 
 def glb_offset(path: Path) -> np.ndarray:
-    """What a .glb says was subtracted from its coordinates, in the scene's own axes, float64 [3]; else zeros.
+    """The offset that a .glb records as subtracted from its coordinates, in OpenCV's axes, float64 [3]; zeros if none.
 
     Raises InputError as `read_glb`.
     """
@@ -109,7 +107,7 @@ def glb_offset(path: Path) -> np.ndarray:
 
 
 def _read_gaussians(path: Path, document: dict[str, Any], binary: bytes) -> Gaussians:
-    """The Gaussians in glTF's frame; raises InputError, or KeyError and the like where the JSON is not as it should."""
+    """The Gaussians in glTF's axes; raises InputError, or KeyError and the like where the JSON is invalid."""
     attributes = _splat_attributes(path, document)
     count = document["accessors"][attributes["POSITION"]]["count"]
     degree = max(d for d in range(4) if set(_coefficients(d)) <= set(attributes))
@@ -132,12 +130,12 @@ def _read_gaussians(path: Path, document: dict[str, Any], binary: bytes) -> Gaus
 
 
 def _coefficients(degree: int) -> list[str]:
-    """Attributes of the spherical harmonics up to a degree, in our order."""
+    """Attribute names of the SH coefficients up to a degree, in the order of `Gaussians.sh`."""
     return [f"{PREFIX}SH_DEGREE_{d}_COEF_{index}" for d in range(degree + 1) for index in range(2 * d + 1)]
 
 
 def _document(attributes: dict[str, np.ndarray]) -> dict[str, Any]:
-    """The JSON that says what the arrays are, which lie one behind the other."""
+    """The JSON document that describes the arrays, which follow each other in the buffer."""
     views: list[dict[str, Any]] = []
     accessors: list[dict[str, Any]] = []
     offset = 0
@@ -187,22 +185,22 @@ def _chunks(path: Path, content: bytes) -> tuple[dict[str, Any], bytes]:
     except (ValueError, RecursionError):
         raise_input_error(path, "its JSON cannot be read", "copy or download it again")
     if not isinstance(document, dict):
-        raise_input_error(path, "its JSON is no glTF", "write it again")
+        raise_input_error(path, "its JSON is not glTF", "write it again")
     return document, chunks.get(BINARY, b"")
 
 
 def _splat_attributes(path: Path, document: dict[str, Any]) -> dict[str, int]:
-    """Attributes of the one primitive with splats, each the index of its accessor."""
+    """The accessor index of each attribute of the one primitive with splats."""
     primitives = [part for mesh in document.get("meshes", []) for part in mesh["primitives"]]
     splats = [part for part in primitives if EXTENSION in part.get("extensions", {})]
     if len(splats) != 1:
-        what = f"{len(splats)} clouds of splats ({EXTENSION})"
+        what = f"{len(splats)} primitives of splats ({EXTENSION})"
         raise_input_error(path, what, "expected one; a mesh or point cloud holds no Gaussians")
     if splats[0]["extensions"][EXTENSION].get("extensions"):
         raise_input_error(path, "the splats are compressed by a further extension", "write it without")
     for node in document.get("nodes", []):
-        if any(node.get(name, still) != still for name, still in STANDING_STILL.items()):
-            raise_input_error(path, "a node moves or turns the splats", "write it with the transformation applied")
+        if any(node.get(name, still) != still for name, still in IDENTITY_TRANSFORMS.items()):
+            raise_input_error(path, "a node transforms the splats", "write it with the transformation applied")
     attributes = splats[0]["attributes"]
     needed = ["POSITION", PREFIX + "ROTATION", PREFIX + "SCALE", PREFIX + "OPACITY", *_coefficients(0)]
     missing = [name for name in needed if name not in attributes]
@@ -212,7 +210,7 @@ def _splat_attributes(path: Path, document: dict[str, Any]) -> dict[str, int]:
 
 
 def _read_accessor(path: Path, document: dict[str, Any], binary: bytes, index: int, kind: str) -> np.ndarray:
-    """One array of the document as float32 [count, parts]."""
+    """One array of the document as float32 [count, components]."""
     accessor = document["accessors"][index]
     if accessor["type"] != kind or "sparse" in accessor:
         raise_input_error(path, f"accessor {index} is {accessor['type']}", f"expected {kind} without sparse values")

@@ -1,9 +1,9 @@
-"""An order of points in which neighbours in space are neighbours in a file."""
+"""Morton (Z-curve) order, in which neighbours in space are close to each other in a file."""
 
 import numpy as np
 
-BITS = 21  # a coordinate: three fill 63
-# Shifts and masks that pull the bits of a number apart, two zeros between any two of them.
+BITS = 21  # of a coordinate: three fill 63 bits
+# Shifts and masks that insert two zeros between any two bits of a number.
 SPREAD = (
     (32, 0x1F00000000FFFF),
     (16, 0x1F0000FF0000FF),
@@ -14,7 +14,7 @@ SPREAD = (
 
 
 def morton_order(points: np.ndarray) -> np.ndarray:
-    """Indices [points] that sort points [points, 3], finite numbers, along a Z-shaped curve through their box."""
+    """Indices [points] that sort points [points, 3], finite numbers, by Morton code within their bounding box."""
     points = points.astype(np.float64)
     low, high = points.min(axis=0, initial=np.inf), points.max(axis=0, initial=-np.inf)
     cells = (points - low) * ((2**BITS - 1) / np.maximum(high - low, np.finfo(np.float32).tiny))

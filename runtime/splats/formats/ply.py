@@ -1,8 +1,8 @@
-"""Gaussians in the .ply layout of 3D Gaussian splatting, which every viewer reads.
+"""Gaussians in the .ply layout of 3DGS (Kerbl et al. 2023), which every viewer reads.
 
-One element `vertex`, binary little endian, float32: x y z, normals that mean nothing, SH band 0 as f_dc_*, the other
-bands as f_rest_* (all of red, then green, then blue), the opacity as its logit, the scales as their logarithms, the
-rotation as a wxyz quaternion. The frame is the scene's own, axes as OpenCV has them.
+One element `vertex`, binary little endian, float32: x y z, normals that are not used, SH of degree 0 as f_dc_*, of the
+higher degrees as f_rest_* (all of red, then green, then blue), opacity as a logit, scales as logarithms, the rotation
+as a wxyz quaternion. The frame is the scene's own, with OpenCV's axes.
 """
 
 import os
@@ -18,21 +18,22 @@ from ...system.files import atomic_write, open_regular
 from ..gaussians import Gaussians, check_ranges
 from .ply_header import LIST, Element, offset_comment, read_header
 
-VERTICES_AT_ONCE = 1 << 13  # their rows stay in the cache while columns are filled one by one
-MIN_OPACITY = 1e-6  # a logit must be finite: opacities are kept this far from 0 and 1
-MIN_SCALE = 1e-30  # so must a logarithm
+VERTICES_AT_ONCE = 1 << 13  # whose rows stay in the cache while columns are filled one by one
+MIN_OPACITY = 1e-6  # logits must be finite: opacities are clipped to this distance from 0 and 1
+MIN_SCALE = 1e-30  # logarithms must be finite
 
 
 def write_ply(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None) -> list[str]:
-    """Write Gaussians, every SH band, as a binary .ply; the file appears whole or not at all.
+    """Write Gaussians as a binary .ply; the file is replaced atomically.
 
     offset: what was subtracted from the world coordinates, [3], which a comment records.
-    Opacities are kept 1e-6 away from 0 and 1, so that their logit is finite. Raises InputError if a value is not
-    finite, a scale is negative, an opacity outside [0, 1], or the file cannot be written.
+    Opacities are clipped to 1e-6 from 0 and 1, so that their logits are finite. Returns no line: nothing is lost.
+    Raises InputError if a value is not finite, a scale is negative, an opacity outside [0, 1], or the file cannot be
+    written.
     """
     check_ranges(path, gaussians)
     names = list(_columns(gaussians))
-    names[3:3] = ["nx", "ny", "nz"]  # gaussforge and some older viewers insist on normals
+    names[3:3] = ["nx", "ny", "nz"]  # gaussforge and some older viewers require normals
     properties = "".join(f"property float {name}\n" for name in names)
     comment = "" if offset is None else offset_comment(offset)
     element = f"element vertex {len(gaussians)}\n"
@@ -55,7 +56,7 @@ def write_ply(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None
 
 
 def read_ply(path: Path) -> Gaussians:
-    """Read a 3DGS .ply: properties in any order, float or double, with or without normals, others left alone.
+    """Read a 3DGS .ply: properties in any order, float or double, with or without normals; others are ignored.
 
     Raises InputError if the file cannot be read, is not such a file, is cut short, or holds a value that is not finite.
     """
@@ -69,7 +70,7 @@ def read_ply(path: Path) -> Gaussians:
 
 
 def _columns(gaussians: Gaussians) -> dict[str, np.ndarray]:
-    """A view of each column, [gaussians], under its name in the file and in the file's usual order."""
+    """A view of each column, [gaussians], by its name in the file, in the usual order."""
     sh = gaussians.sh
     rest = sh.shape[1] - 1
     columns = {name: gaussians.means[:, axis] for axis, name in enumerate("xyz")}
@@ -82,27 +83,27 @@ def _columns(gaussians: Gaussians) -> dict[str, np.ndarray]:
 
 
 def _blocks(count: int) -> Iterator[slice]:
-    """0 to count in steps that fit the cache."""
+    """Slices of 0 to count that fit the cache."""
     for start in range(0, count, VERTICES_AT_ONCE):
         yield slice(start, min(start + VERTICES_AT_ONCE, count))
 
 
 def _reserve(file: BinaryIO, size: int) -> None:
-    """Claim the disk space at once where the system can: writing is three times faster than letting the file grow."""
+    """Allocate the disk space at once where the system can: writing is three times faster than to a growing file."""
     if hasattr(os, "posix_fallocate"):
-        with suppress(OSError):  # not every file system can; a full disk shows again when it is written to
+        with suppress(OSError):  # not every file system can; a full disk is noticed when it is written to
             os.posix_fallocate(file.fileno(), 0, size)
 
 
 def _encode(gaussians: Gaussians, block: slice, rows: np.ndarray) -> None:
-    """Fill rows of the file with a block of the Gaussians: `_columns` in order, the normals after the means left alone.
+    """Fill rows of the file with a block of the Gaussians: `_columns` in order, with the normals after the means.
 
-    What has three or four parts goes column by column, since NumPy is slow where its innermost loop is so short.
+    Arrays of three or four columns are copied column by column: NumPy is slow with innermost loops so short.
     """
     sh = gaussians.sh[block]
     coefficients = sh.shape[1]
-    places = np.arange(3 * coefficients).reshape(coefficients, 3)  # of coefficient and channel, in the rows of sh
-    order = np.concatenate([places[0], places[1:].T.ravel()])
+    index = np.arange(3 * coefficients).reshape(coefficients, 3)  # of coefficient and channel, in the rows of sh
+    order = np.concatenate([index[0], index[1:].T.ravel()])
     rows[:, 6:-8] = sh.reshape(len(sh), -1).take(order, axis=1)
     opacities = np.clip(gaussians.opacities[block], MIN_OPACITY, 1 - MIN_OPACITY)
     log_scales = np.log(np.maximum(gaussians.scales[block], MIN_SCALE))
@@ -115,7 +116,7 @@ def _encode(gaussians: Gaussians, block: slice, rows: np.ndarray) -> None:
 
 
 class _Vertices(NamedTuple):
-    """Where the vertices lie in a file and what a row of them holds."""
+    """Position and layout of the vertices in a file."""
 
     offset: int
     length: int
@@ -124,7 +125,7 @@ class _Vertices(NamedTuple):
 
 
 def _read_vertices(file: BinaryIO, path: Path, vertices: _Vertices) -> Gaussians:
-    """The rows of a checked file, decoded."""
+    """Decode the rows of a checked file."""
     count = vertices.length
     gaussians = Gaussians(
         means=np.empty((count, 3), np.float32),
@@ -134,7 +135,7 @@ def _read_vertices(file: BinaryIO, path: Path, vertices: _Vertices) -> Gaussians
         sh=np.empty((count, vertices.sh_coefficients, 3), np.float32),
     )
     file.seek(vertices.offset)
-    # To infinity or NaN, which are refused below, or to an opacity of 0, which is meant.
+    # Overflow to infinity or NaN is checked for below; an opacity that underflows to 0 is right.
     with np.errstate(over="ignore", invalid="ignore"):
         for block in _blocks(count):
             rows = np.frombuffer(file.read((block.stop - block.start) * vertices.row.itemsize), vertices.row)
@@ -144,25 +145,25 @@ def _read_vertices(file: BinaryIO, path: Path, vertices: _Vertices) -> Gaussians
 
 
 def _decode(rows: np.ndarray, gaussians: Gaussians, block: slice) -> None:
-    """Fill a block of the Gaussians from structured rows of a file, whatever the order of its columns."""
-    table, place = _float_table(rows, list(_columns(gaussians)))
+    """Fill a block of the Gaussians from structured rows of a file, in whatever order its columns are."""
+    table, column = _float_table(rows, list(_columns(gaussians)))
     sh, scales, opacities = gaussians.sh[block], gaussians.scales[block], gaussians.opacities[block]
     coefficients = sh.shape[1]
     for axis, name in enumerate("xyz"):
-        gaussians.means[block, axis] = table[:, place[name]]
-        scales[:, axis] = table[:, place[f"scale_{axis}"]]
+        gaussians.means[block, axis] = table[:, column[name]]
+        scales[:, axis] = table[:, column[f"scale_{axis}"]]
     np.exp(scales, out=scales)
-    opacities[:] = 1 / (1 + np.exp(-table[:, place["opacity"]]))
+    opacities[:] = 1 / (1 + np.exp(-table[:, column["opacity"]]))
     for part in range(4):
-        gaussians.quats[block, part] = table[:, place[f"rot_{part}"]]
+        gaussians.quats[block, part] = table[:, column[f"rot_{part}"]]
     names = [f"f_dc_{channel}" for channel in range(3)]
     names += [f"f_rest_{channel * (coefficients - 1) + k}" for k in range(coefficients - 1) for channel in range(3)]
-    # All at once and already in their places ("clip" lets it write there directly).
-    np.take(table, [place[name] for name in names], axis=1, out=sh.reshape(len(rows), len(names)), mode="clip")
+    # mode="clip" lets take() write to `out` without a buffer.
+    np.take(table, [column[name] for name in names], axis=1, out=sh.reshape(len(rows), len(names)), mode="clip")
 
 
 def _float_table(rows: np.ndarray, names: list[str]) -> tuple[np.ndarray, dict[str, int]]:
-    """Rows as float32 [rows, columns], with the columns of these names in the places given; usually a mere view."""
+    """Rows as float32 [rows, columns], and the column of each name; a view where all columns are float32."""
     own = rows.dtype.names or ()
     if all(rows.dtype[name] == np.float32 for name in own):
         return rows.view(np.float32).reshape(len(rows), len(own)), {name: index for index, name in enumerate(own)}
@@ -173,7 +174,7 @@ def _float_table(rows: np.ndarray, names: list[str]) -> tuple[np.ndarray, dict[s
 def _check_finite(gaussians: Gaussians, block: slice, path: Path) -> None:
     """Raise InputError for the first value of a block of decoded Gaussians that is not finite."""
     arrays = (gaussians.means, gaussians.scales, gaussians.quats, gaussians.opacities, gaussians.sh)
-    if all(np.isfinite(array[block].sum()) for array in arrays):  # no sum of others is finite, and it is quicker
+    if all(np.isfinite(array[block].sum()) for array in arrays):  # quicker: the sum is finite only if every value is
         return
     for name, column in _columns(gaussians).items():
         for vertex in np.flatnonzero(~np.isfinite(column[block])):
@@ -183,7 +184,7 @@ def _check_finite(gaussians: Gaussians, block: slice, path: Path) -> None:
 
 
 def _find_vertices(file: BinaryIO, path: Path) -> _Vertices:
-    """Check header and size of a file against what a splat file must have."""
+    """Check the header and the size of a splat file."""
     offset = 0
     elements, header_bytes = read_header(file, path)
     for element in elements:
@@ -211,7 +212,7 @@ def _find_vertices(file: BinaryIO, path: Path) -> _Vertices:
 
 
 def _checked_properties(vertex: Element, path: Path) -> int:
-    """SH coefficients a channel of an element that has all that a Gaussian needs, as floating-point numbers."""
+    """SH coefficients per channel of an element, once it has all properties of a Gaussian as floating-point numbers."""
     rest = sum(name.startswith("f_rest_") for name in vertex.properties)
     coefficients = 1 + rest // 3
     if rest not in (0, 9, 24, 45):

@@ -1,4 +1,4 @@
-"""What a .ply file announces about itself, for every layout that is written into one."""
+"""Headers of .ply files, for every layout of Gaussians in them."""
 
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -28,8 +28,8 @@ NUMBER_TYPES = {
     "double": "<f8",
     "float64": "<f8",
 }
-OFFSET = "offset"  # a comment of three numbers: what was subtracted from the world coordinates
-LIST = "list"  # the type of a property whose length differs from row to row
+OFFSET = "offset"  # a comment with three numbers: what was subtracted from the world coordinates
+LIST = "list"  # the type of a property of variable length
 
 
 class Element(NamedTuple):
@@ -41,12 +41,12 @@ class Element(NamedTuple):
 
     @property
     def row(self) -> np.dtype:
-        """The type of a row of an element without lists."""
+        """The NumPy type of a row of an element without lists."""
         return np.dtype(list(self.properties.items()))
 
 
 def read_header(file: BinaryIO, path: Path) -> tuple[list[Element], int]:
-    """The elements that a binary little endian .ply header announces, and the header's length in bytes.
+    """The elements of a binary little endian .ply header, and the header's length in bytes.
 
     Raises InputError, naming the path, if the file does not begin with such a header.
     """
@@ -79,7 +79,7 @@ def read_header(file: BinaryIO, path: Path) -> tuple[list[Element], int]:
                 pass
             case words:
                 raise_input_error(
-                    path, f"header line '{' '.join(words)[:60]}' means nothing here", "write the file again"
+                    path, f"header line '{' '.join(words)[:60]}' is not understood", "write the file again"
                 )
     raise_input_error(path, "the header has no end", "copy or download it again")
 
@@ -91,7 +91,7 @@ def _add_property(element: Element, name: str, number_type: str, path: Path) -> 
 
 
 def has_element(path: Path, name: str) -> bool:
-    """Whether a file's header announces this element; raises InputError if it is no .ply that can be read."""
+    """Whether a file's header has this element; raises InputError if it is no .ply that can be read."""
     try:
         with open_regular(path) as file:
             return any(element.name == name for element in read_header(file, path)[0])
@@ -100,14 +100,14 @@ def has_element(path: Path, name: str) -> bool:
 
 
 def offset_comment(offset: np.ndarray) -> str:
-    """The line of a header that records an offset [3]; none for zeros."""
+    """The header line that records an offset [3]; empty for zeros."""
     return f"comment {OFFSET} {' '.join(map(repr, offset.tolist()))}\n" if offset.any() else ""
 
 
 def header_offset(path: Path) -> np.ndarray:
-    """What a file's header says was subtracted from its coordinates, float64 [3]; zeros where it says nothing.
+    """The offset that a file's header records as subtracted from its coordinates, float64 [3]; zeros if none.
 
-    Raises InputError if the file cannot be read, or what it says is no offset.
+    Raises InputError if the file cannot be read, or the offset is not three finite numbers.
     """
     try:
         with open_regular(Path(path)) as file:
@@ -123,7 +123,7 @@ def header_offset(path: Path) -> np.ndarray:
 
 
 def checked_offset(path: Path, values: object) -> np.ndarray:
-    """An offset as a file has it, as float64 [3]; raises InputError if it is none."""
+    """An offset read from a file as float64 [3]; raises InputError unless it is three finite numbers."""
     try:
         offset = np.array(values, np.float64)
     except (TypeError, ValueError):

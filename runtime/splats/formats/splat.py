@@ -1,8 +1,8 @@
-"""Gaussians as .splat files, which the first viewers in browsers read: 32 bytes each and no header.
+"""Gaussians as .splat files (antimatter15/splat): 32 bytes each, without a header.
 
-Position and scales as float32, colour and opacity in 8 bits each, the rotation as a wxyz quaternion in 8 bits a part
-around 128. The frame is the one of .ply files. Colours and opacities come back within 1/510 and the parts of the unit
-quaternion within 1/64; colours outside [0, 1] are clipped, and there are no spherical harmonics above degree 0.
+Means and scales as float32, colour and opacity in 8 bits each, the rotation as a wxyz quaternion in 8 bits a component
+around 128. The frame is the one of .ply files. Errors are at most 1/510 for colours and opacities and 1/64 for the
+components of the unit quaternion. Colours outside [0, 1] are clipped, and SH above degree 0 is lost.
 """
 
 from pathlib import Path
@@ -16,11 +16,11 @@ from ..gaussians import Gaussians, check_finite, check_ranges, with_colours
 from .encoding import clipped_note, lost_offset, round_to_uint8
 
 RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
-ZERO, ONE = 128, 128  # of the rotation's bytes
+QUAT_ZERO, QUAT_STEPS = 128, 128  # byte = component * 128 + 128
 
 
 def write_splat(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None) -> list[str]:
-    """Write Gaussians as a .splat; the file appears whole or not at all.
+    """Write Gaussians as a .splat; the file is replaced atomically.
 
     Returns a line for each thing that the format cannot hold. Raises InputError if a value is not finite or not in our
     units, or the file cannot be written.
@@ -32,15 +32,15 @@ def write_splat(path: Path, gaussians: Gaussians, offset: np.ndarray | None = No
     records["scale"] = gaussians.scales
     records["rgba"][:, :3] = round_to_uint8(gaussians.colours * 255)
     records["rgba"][:, 3] = round_to_uint8(gaussians.opacities * 255)
-    records["quat"] = round_to_uint8(normalize_quaternions(gaussians.quats) * ONE + ZERO)
+    records["quat"] = round_to_uint8(normalize_quaternions(gaussians.quats) * QUAT_STEPS + QUAT_ZERO)
     with atomic_write(path) as temporary:
         temporary.write_bytes(records.tobytes())
-    lost = ["spherical harmonics above degree 0 left out"] if gaussians.sh_degree else []
+    lost = ["SH coefficients above degree 0 were left out"] if gaussians.sh_degree else []
     return lost + clipped_note("colours", gaussians.colours, 0, 1) + lost_offset(offset)
 
 
 def read_splat(path: Path) -> Gaussians:
-    """Read a .splat; raises InputError if the file cannot be read, is not one, or holds a value that is none."""
+    """Read a .splat; raises InputError if the file cannot be read, is not one, or holds a value that is not finite."""
     content = read_bytes(path, "a splat file (.splat)")
     if len(content) % RECORD.itemsize:
         raise_input_error(
@@ -50,7 +50,7 @@ def read_splat(path: Path) -> Gaussians:
     if (records["scale"] < 0).any():
         raise_input_error(path, "negative scales", "expected standard deviations; it is not a .splat file, or damaged")
     rgba = records["rgba"] / np.float32(255)
-    quats = normalize_quaternions((records["quat"] - np.float32(ZERO)) / ONE)
+    quats = normalize_quaternions((records["quat"] - np.float32(QUAT_ZERO)) / QUAT_STEPS)
     gaussians = with_colours(records["mean"], records["scale"], quats, rgba[:, 3], rgba[:, :3])
     check_finite(path, gaussians)
     return gaussians

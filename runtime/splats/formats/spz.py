@@ -1,14 +1,14 @@
-"""Gaussians as .spz files (Niantic), some ten times smaller than .ply.
+"""Gaussians as .spz files (nianticlabs/spz), some ten times smaller than .ply.
 
-Version 3 is written, a gzip stream; 2 to 4 are read. A header, then all positions, opacities, colours, scales,
-rotations and spherical harmonics. The frame is OpenGL's (x right, y up, z backward), so a scene is turned by half
-around x.
+Version 3, a gzip stream, is written; versions 2 to 4 are read. A header, then all positions, opacities, colours,
+scales, rotations and SH coefficients. The axes are OpenGL's (x right, y up, z backward), a rotation by 180 degrees
+about x.
 
-positions: 24 bits each, as many of them behind the point as the scene's extent leaves: within 2^-23 of the largest
-coordinate or 2^-25 units, whichever is larger. opacities: 8 bits, within 1/510. colours: 8 bits, within 1/271 from
--0.44 to 1.44. scales: 8 bits of the logarithm, within 3.2 %, from 4.5e-5 to 379. rotations: 10 bits for each of the
-smallest three parts of the quaternion, each within 7e-4 (version 2: 8 bits for each of x, y and z). spherical harmonics
-of degree 1 to 3: 8 bits, within 1/256 from -1 to 0.996.
+Precision, with the largest error: positions: 24-bit fixed point with as many fractional bits as the extent leaves,
+2^-23 of the largest coordinate or 2^-25 units. opacities: 8 bits, 1/510. colours: 8 bits, 1/271, from -0.44 to 1.44.
+scales: 8 bits of the logarithm, 3.2 %, from 4.5e-5 to 379. rotations: 10 bits for each of the quaternion's smallest
+three components, 7e-4 each (version 2: 8 bits for each of x, y and z). SH of degree 1 to 3: 8 bits, 1/256, from -1 to
+0.996.
 """
 
 import zlib
@@ -23,38 +23,38 @@ from ...system.files import atomic_write, read_bytes
 from ..axes import OPENGL, convert_axes
 from ..gaussians import Gaussians, check_finite, check_ranges
 from .encoding import clipped_note, lost_offset, round_to_uint8
-from .spz_container import EXPECTED, HEADER, MAGIC, MOST_FRACTIONAL_BITS, unpack
+from .spz_container import EXPECTED, HEADER, MAGIC, MAX_FRACTIONAL_BITS, unpack
 
-VERSION = 3  # to write: version 4 is not read everywhere yet
+VERSION = 3  # that is written: not every viewer reads version 4 yet
 
 POSITION_LIMIT = (1 << 23) - 1  # of 24 bits with a sign
 LOG_SCALE_STEPS, LOG_SCALE_OFFSET = 16, 10  # byte = (log scale + 10) * 16
-COLOUR_STEPS = 0.15 * 255  # byte = sh * steps + 127.5: the range is wider than that of colours
+COLOUR_STEPS = 0.15 * 255  # byte = sh * COLOUR_STEPS + 127.5: a range wider than [0, 1]
 SH_STEPS = 128  # byte = sh * 128 + 128
-SH_HIGHEST = 127.5 / 128  # rounded, the highest byte
-QUAT_STEPS = 511 / np.sqrt(0.5)  # magnitude of a smallest part in 9 bits; the tenth is its sign
+SH_HIGHEST = 127.5 / 128  # is rounded to 255
+QUAT_STEPS = 511 / np.sqrt(0.5)  # magnitude of a component in 9 bits; the tenth is its sign
 
 
 def write_spz(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None) -> list[str]:
-    """Write Gaussians as a .spz; the file appears whole or not at all.
+    """Write Gaussians as a .spz; the file is replaced atomically.
 
     Returns a line for each thing that the format cannot hold. Raises InputError if a value is not finite or not in our
-    units, the scene is larger than the format, or the file cannot be written.
+    units, a coordinate is beyond the format's range, or the file cannot be written.
     """
     check_ranges(path, gaussians)
     check_finite(path, gaussians)
-    turned = convert_axes(gaussians, OPENGL)
-    bits = _fractional_bits(path, turned.means)
-    rest = turned.sh[:, 1:]
+    converted = convert_axes(gaussians, OPENGL)
+    bits = _fractional_bits(path, converted.means)
+    rest = converted.sh[:, 1:]
     with np.errstate(divide="ignore"):
-        log_scales = np.log(turned.scales)
+        log_scales = np.log(converted.scales)
     parts = [
-        HEADER.pack(MAGIC, VERSION, len(turned), turned.sh_degree, bits, 0, 0),
-        _pack_positions(turned.means, bits),
-        round_to_uint8(turned.opacities * 255),
-        round_to_uint8(turned.sh[:, 0] * COLOUR_STEPS + 127.5),
+        HEADER.pack(MAGIC, VERSION, len(converted), converted.sh_degree, bits, 0, 0),
+        _pack_positions(converted.means, bits),
+        round_to_uint8(converted.opacities * 255),
+        round_to_uint8(converted.sh[:, 0] * COLOUR_STEPS + 127.5),
         round_to_uint8((log_scales + LOG_SCALE_OFFSET) * LOG_SCALE_STEPS),
-        _pack_rotations(turned.quats),
+        _pack_rotations(converted.quats),
         round_to_uint8(rest * SH_STEPS + SH_STEPS),
     ]
     compressor = zlib.compressobj(wbits=31)  # gzip's header and trailer
@@ -63,8 +63,8 @@ def write_spz(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None
             file.write(compressor.compress(part if isinstance(part, bytes) else np.ascontiguousarray(part).data))
         file.write(compressor.flush())
     highest = np.exp(255 / LOG_SCALE_STEPS - LOG_SCALE_OFFSET)
-    notes = clipped_note("scales", turned.scales, np.exp(-LOG_SCALE_OFFSET), highest)
-    notes += clipped_note("spherical harmonics", rest, -1, SH_HIGHEST)
+    notes = clipped_note("scales", converted.scales, np.exp(-LOG_SCALE_OFFSET), highest)
+    notes += clipped_note("SH coefficients", rest, -1, SH_HIGHEST)
     return notes + clipped_note("colours", gaussians.colours, *_colour_range()) + lost_offset(offset)
 
 
@@ -92,32 +92,32 @@ def read_spz(path: Path) -> Gaussians:
 
 
 def _fractional_bits(path: Path, means: np.ndarray) -> int:
-    """As many bits behind the point as the largest coordinate leaves of 24."""
+    """The most fractional bits with which the largest coordinate fits 24 bits."""
     largest = float(np.abs(means).max(initial=0))
     if largest > POSITION_LIMIT:
         raise_input_error(
             path, f"the scene reaches {largest:g} units", f"a .spz holds {POSITION_LIMIT}; write a .ply instead"
         )
-    bits = MOST_FRACTIONAL_BITS
+    bits = MAX_FRACTIONAL_BITS
     while round(largest * 2**bits) > POSITION_LIMIT:
         bits -= 1
     return bits
 
 
 def _pack_positions(means: np.ndarray, bits: int) -> np.ndarray:
-    """Fixed-point numbers in three bytes, the lowest first."""
+    """24-bit fixed-point numbers, little endian, uint8 [gaussians, 3, 3]."""
     fixed = np.rint(means.astype(np.float64) * 2**bits).astype("<i4", order="C")
     return fixed.view(np.uint8).reshape(-1, 3, 4)[..., :3]
 
 
 def _unpack_positions(packed: np.ndarray, bits: int) -> np.ndarray:
     fixed = np.zeros((len(packed), 3, 4), np.uint8)
-    fixed[..., 1:] = packed.reshape(-1, 3, 3)  # in the upper bytes, so that the shift down repeats the sign
+    fixed[..., 1:] = packed.reshape(-1, 3, 3)  # in the upper bytes, so that the right shift extends the sign
     return ((fixed.view("<i4")[..., 0] >> 8) / 2**bits).astype(np.float32)
 
 
 def _pack_rotations(quats: np.ndarray) -> np.ndarray:
-    """Which part of xyzw is the largest in 2 bits, then sign and magnitude of the others in order, 10 bits each."""
+    """Smallest three of xyzw: the index of the largest in 2 bits, then the others as sign and 9-bit magnitude."""
     largest, others = smallest_three(np.roll(normalize_quaternions(quats), -1, axis=1))
     packed = largest.astype("<u4")
     for part in others.T:
@@ -134,13 +134,13 @@ def _unpack_rotations(packed: np.ndarray) -> np.ndarray:
 
 
 def _unpack_version_2_rotations(packed: np.ndarray) -> np.ndarray:
-    """Version 2 keeps x, y and z in 8 bits each; w is positive."""
+    """Version 2: x, y and z in 8 bits each; w = sqrt(1 - x^2 - y^2 - z^2)."""
     xyz = packed / np.float32(127.5) - 1
     w = np.sqrt(np.maximum(1 - np.square(xyz).sum(axis=1, keepdims=True), 0))
     return np.concatenate([w, xyz], axis=1)
 
 
 def _colour_range() -> tuple[float, float]:
-    """Colours whose bytes are 0 and 255."""
+    """The colours of the bytes 0 and 255."""
     reach = SH_0 * 127.5 / COLOUR_STEPS
     return 0.5 - reach, 0.5 + reach

@@ -1,4 +1,4 @@
-"""What .spz files wrap their numbers in: one gzip stream up to version 3, a zstd stream for each kind in version 4."""
+"""The container of .spz files: one gzip stream up to version 3, a zstd stream for each attribute in version 4."""
 
 import struct
 import zlib
@@ -8,21 +8,21 @@ from typing import NamedTuple
 from ...errors import InputError, raise_input_error
 from ...system.files import check_expansion
 
-HEADER = struct.Struct("<4sIIBBBB")  # magic, version, Gaussians, SH degree, bits behind the point, flags, and one more
+HEADER = struct.Struct("<4sIIBBBB")  # magic, version, Gaussians, SH degree, fractional bits, flags, reserved
 MAGIC = b"NGSP"
 GZIP = b"\x1f\x8b"
 HAS_EXTENSIONS = 2  # flag
-MOST_FRACTIONAL_BITS = 24
+MAX_FRACTIONAL_BITS = 24
 EXPECTED = "a splat file (.spz)"
-# Version 4 goes on in the header: where the table of contents begins, then nothing.
+# The rest of version 4's header: where the table of contents begins.
 CONTENTS_AT = struct.Struct("<16xI12x")
-CONTENTS_ENTRY = struct.Struct("<QQ")  # packed and unpacked size of a stream
-LARGEST_WINDOW = 1 << 27  # bytes that a zstd stream may look back
+CONTENTS_ENTRY = struct.Struct("<QQ")  # compressed and uncompressed size of a stream
+MAX_WINDOW = 1 << 27  # bytes, of a zstd stream
 AGAIN = "copy or download it again"
 
 
 class Header(NamedTuple):
-    """What precedes the numbers."""
+    """The fields of the header that are used."""
 
     version: int
     gaussians: int
@@ -31,14 +31,15 @@ class Header(NamedTuple):
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """Bytes a Gaussian of positions, opacities, colours, scales, rotations and spherical harmonics."""
+        """Bytes per Gaussian of positions, opacities, colours, scales, rotations and SH coefficients."""
         return 9, 1, 3, 3, 3 if self.version == 2 else 4, 3 * ((self.sh_degree + 1) ** 2 - 1)
 
 
 def unpack(path: Path, content: bytes) -> tuple[Header, bytes]:
-    """Header and numbers, one kind after the other, of a file's content; never more than the header announces.
+    """Header and uncompressed attributes, in the order of `Header.sizes`, of a file's content.
 
-    Raises InputError, naming the path, for what is not .spz of version 2 to 4, or damaged.
+    Raises InputError, naming the path, if it is not .spz of version 2 to 4, or damaged. No more is
+    uncompressed than the header announces.
     """
     if content.startswith(MAGIC):
         return _unpack_zstd(path, content)
@@ -83,7 +84,7 @@ def _unpack_zstd(path: Path, content: bytes) -> tuple[Header, bytes]:
         packed, unpacked = CONTENTS_ENTRY.unpack_from(content, start + index * CONTENTS_ENTRY.size)
         if unpacked != size:
             raise_input_error(path, f"stream {index} holds {unpacked} bytes of {size}", AGAIN)
-        reader = zstandard.ZstdDecompressor(max_window_size=LARGEST_WINDOW)
+        reader = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW)
         try:
             parts.append(reader.stream_reader(content[offset : offset + packed]).read(size))
         except zstandard.ZstdError:
@@ -95,7 +96,7 @@ def _unpack_zstd(path: Path, content: bytes) -> tuple[Header, bytes]:
 
 
 def _read_header(path: Path, content: bytes, versions: tuple[int, ...]) -> Header:
-    """The header at the beginning of the content, once it is one whose numbers we know to read."""
+    """The header, checked for what can be read."""
     if len(content) < HEADER.size:
         raise_input_error(path, "cut short in its header", AGAIN)
     magic, version, gaussians, sh_degree, fractional_bits, flags, _ = HEADER.unpack_from(content)
@@ -105,8 +106,8 @@ def _read_header(path: Path, content: bytes, versions: tuple[int, ...]) -> Heade
         raise_input_error(path, f".spz of version {version}", "expected version 2 to 4; write it as one of those")
     if sh_degree > 3:
         raise_input_error(path, f"SH degree {sh_degree}", "expected 0 to 3; write it with one of those")
-    if fractional_bits > MOST_FRACTIONAL_BITS:
-        raise_input_error(path, f"{fractional_bits} bits behind the point", f"expected at most {MOST_FRACTIONAL_BITS}")
+    if fractional_bits > MAX_FRACTIONAL_BITS:
+        raise_input_error(path, f"{fractional_bits} fractional bits", f"expected at most {MAX_FRACTIONAL_BITS}")
     if flags & HAS_EXTENSIONS:
         raise_input_error(path, "has extensions, which may change its axes", "write it without them")
     return Header(version, gaussians, sh_degree, fractional_bits)

@@ -108,7 +108,7 @@ BROKEN_SPZ = {
     "other magic": (gzipped(spz_header(magic=b"GSPN")), "gzip stream of something else"),
     "short header": (gzipped(spz_header()[:10]), "cut short in its header"),
     "degree 4": (gzipped(spz_header(degree=4)), "SH degree 4; expected 0 to 3"),
-    "bits": (gzipped(spz_header(bits=60)), "60 bits behind the point"),
+    "bits": (gzipped(spz_header(bits=60)), "60 fractional bits"),
     "extensions": (gzipped(spz_header(flags=2)), "has extensions"),
     "too few": (gzipped(spz_header(count=3) + b"\x00" * 59), "cut short: 3 Gaussians need 60 bytes"),
     "far too many": (gzipped(spz_header(count=1 << 31)), "claim to hold 42949672960 are no scene"),
@@ -214,14 +214,14 @@ BROKEN_SOG = {
     "far too many": (lambda files, meta: meta.update(count=10**12), r"claim to hold \d{14,} are no scene"),
     "more than there are": (lambda files, meta: meta.update(count=17), "has 4x4 pixels for 17 values"),
     "picture missing": (lambda files, meta: files.pop("quats.webp"), "quats.webp"),
-    "picture of 268 million pixels": (
+    "image of 268 million pixels": (
         lambda files, meta: files.update({"scales.webp": webp((16, 16, 3))[:21] + b"\xff" * 4 + b"\0" * 99}),
         "16384x16384 pixels for 5 values",
     ),
     "lossy": (lambda files, meta: files.update({"scales.webp": webp((4, 4, 3), 80)}), "not a lossless WebP"),
     "not a picture": (lambda files, meta: files.update({"scales.webp": b"RIFF" * 20}), "not a lossless WebP"),
     "without alpha": (lambda files, meta: files.update({"quats.webp": webp((4, 4, 3))}), "quats has no alpha"),
-    "no largest part": (lambda files, meta: files.update({"quats.webp": webp((4, 4, 4))}), "which of its parts"),
+    "no largest component": (lambda files, meta: files.update({"quats.webp": webp((4, 4, 4))}), "largest component"),
     "short codebook": (lambda files, meta: meta["sh0"]["codebook"].pop(), r"sh0.codebook has shape \(255,\)"),
     "words in a codebook": (lambda files, meta: meta["sh0"].update(codebook=["x"] * 256), "ValueError"),
     "NaN": (lambda files, meta: meta["scales"].update(codebook=[float("nan")] * 256), "scales of Gaussian 0 is not"),
@@ -229,10 +229,10 @@ BROKEN_SOG = {
         lambda files, meta: meta["means"].update(mins=[float("-inf")] * 3),
         "means of Gaussian 0 is not",
     ),
-    "degree 7": (lambda files, meta: meta["shN"].update(bands=7), "harmonics of degree 7"),
+    "degree 7": (lambda files, meta: meta["shN"].update(bands=7), "SH of degree 7"),
     "sets that are not there": (
         lambda files, meta: files.update({"shN_labels.webp": webp((4, 4, 3))}),
-        f"harmonics {77 * 257} of 5",
+        f"centroid {77 * 257} of 5",
     ),
 }
 
@@ -301,13 +301,13 @@ def primitive(document: dict) -> dict:
 
 
 BROKEN_GLB = {
-    "a mesh": (lambda d: primitive(d).pop("extensions"), "0 clouds of splats"),
-    "two clouds": (lambda d: d["meshes"].append(d["meshes"][0]), "2 clouds of splats"),
+    "a mesh": (lambda d: primitive(d).pop("extensions"), "0 primitives of splats"),
+    "two primitives": (lambda d: d["meshes"].append(d["meshes"][0]), "2 primitives of splats"),
     "compressed": (
         lambda d: primitive(d)["extensions"]["KHR_gaussian_splatting"].update(extensions={"spz": {}}),
         "compressed by a further extension",
     ),
-    "moved": (lambda d: d["nodes"][0].update(translation=[0, 0, 1]), "a node moves or turns"),
+    "moved": (lambda d: d["nodes"][0].update(translation=[0, 0, 1]), "a node transforms"),
     "no opacity": (
         lambda d: primitive(d)["attributes"].pop("KHR_gaussian_splatting:OPACITY"),
         "no KHR_gaussian_splatting:OPACITY",
@@ -318,7 +318,7 @@ BROKEN_GLB = {
     "beyond the end": (lambda d: d["accessors"][0].update(count=10**9), "cut short: accessor 0"),
     "before the beginning": (lambda d: d["bufferViews"][0].update(byteOffset=-4), "cut short: accessor 0"),
     "fewer": (lambda d: d["accessors"][2].update(count=4), "4 values of KHR_gaussian_splatting:ROTATION for 5 splats"),
-    "no accessors": (lambda d: d.pop("accessors"), "not glTF as it should be .KeyError"),
+    "no accessors": (lambda d: d.pop("accessors"), "invalid glTF .KeyError"),
     "a list for a number": (lambda d: d["accessors"][0].update(count=[]), "TypeError"),
 }
 

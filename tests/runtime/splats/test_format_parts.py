@@ -85,21 +85,21 @@ def test_chunks_keep_their_own_precision(tmp_path: Path) -> None:
 def test_codebooks_reach_everywhere_and_are_dense_where_values_are() -> None:
     rng = np.random.default_rng(0)
     values = np.concatenate([rng.normal(0, 0.01, 20_000), [-5, 5]])
-    book = build_codebook(values)
-    assert book.shape == (256,) and (np.diff(book) >= 0).all()
-    off = np.abs(book[quantize(values, book)] - values)
+    codebook = build_codebook(values)
+    assert codebook.shape == (256,) and (np.diff(codebook) >= 0).all()
+    off = np.abs(codebook[quantize(values, codebook)] - values)
     assert off.max() <= 10 / 256
     assert np.median(off) < 1e-3  # evenly spread ones would be off by .01
-    np.testing.assert_array_equal(quantize(values, book), np.abs(book[None] - values[:, None]).argmin(axis=1))
+    np.testing.assert_array_equal(quantize(values, codebook), np.abs(codebook[None] - values[:, None]).argmin(axis=1))
     np.testing.assert_array_equal(build_codebook(np.full(7, 3.0)), np.full(256, 3.0))
 
 
-def test_palettes_choose_the_nearest_of_learned_vectors(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_clustering_assigns_the_nearest_centroid(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(0)
     vectors = rng.normal(size=(3000, 6)).astype(np.float32)
     few, labels = cluster_vectors(vectors)
     np.testing.assert_array_equal(few[labels], vectors)
-    monkeypatch.setattr(codebooks, "PALETTE", 64)
+    monkeypatch.setattr(codebooks, "CENTROIDS", 64)
     learned, labels = cluster_vectors(vectors)
     assert learned.shape == (64, 6)
     distances = np.linalg.norm(vectors[:, None] - learned[None], axis=-1)

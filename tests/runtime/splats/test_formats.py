@@ -130,7 +130,7 @@ def foreign_bounds(suffix: str, truth: Gaussians) -> Bounds:
     bounds = our_bounds(suffix, truth)
     doubled = Bounds(tuple(2 * value for value in bounds.means), *(2 * value for value in bounds[1:]))
     if suffix == ".spz":
-        # 12 bits behind the point; spherical harmonics in buckets of 8 (degree 1) and 16 (degree 2) of 256.
+        # 12 fractional bits; SH coefficients in buckets of 8 (degree 1) and 16 (degree 2) of 256.
         return doubled._replace(means=(2.0**-13,) * 3, sh=8.5 / 128)
     return doubled
 
@@ -140,7 +140,7 @@ def test_we_read_what_others_wrote(truth: Gaussians, name: str) -> None:
     suffix = FOREIGN[name]
     back = read_splats(DATA / name)
     assert back.sh_degree == min(2, highest_degree(suffix))
-    if suffix == ".sog":  # 256 sets of spherical harmonics for 270 Gaussians, so that at least 14 share another's
+    if suffix == ".sog":  # 256 centroids of SH for 270 Gaussians, so that at least 14 share one
         order = np.linalg.norm(back.means[:, None] - truth.means[None], axis=-1).argmin(axis=1)
         off = np.abs(back.sh[:, 1:] - truth.sh[order, 1:]).max(axis=(1, 2))
         assert 14 <= (off > foreign_bounds(suffix, truth).sh).sum() <= 2 * 14
@@ -234,10 +234,10 @@ def test_what_a_format_cannot_hold_is_said(tmp_path: Path, truth: Gaussians) -> 
     scene.sh[7, 0] = 2 / SH_0
     notes = {suffix: " ".join(write_splats(tmp_path / f"scene{suffix}", scene)) for suffix in FORMATS}
     assert notes[".ply"] == ""
-    assert "above degree 0 left out" in notes[".splat"] and "3 of 810 colours outside 0 to 1" in notes[".splat"]
-    for text in ("1 of 810 scales outside 4.54e-05", "1 of 2,430 spherical harmonics", "3 of 810 colours"):
+    assert "above degree 0 were left out" in notes[".splat"] and "3 of 810 colours outside 0 to 1" in notes[".splat"]
+    for text in ("1 of 810 scales outside 4.54e-05", "1 of 2,430 SH coefficients", "3 of 810 colours"):
         assert text in notes[".spz"]
-    assert "1 of 810 scales" in notes[".compressed.ply"] and "1 of 2,430 spherical" in notes[".compressed.ply"]
+    assert "1 of 810 scales" in notes[".compressed.ply"] and "1 of 2,430 SH" in notes[".compressed.ply"]
 
 
 # ---- names and the command
@@ -265,7 +265,7 @@ def test_points_of_a_scene(tmp_path: Path, truth: Gaussians, suffix: str) -> Non
 
 def test_a_surface_is_not_made_of_gaussians(tmp_path: Path, truth: Gaussians) -> None:
     for suffix in MESH_ENDINGS:
-        with pytest.raises(InputError, match="write it with idesplat-infer"):
+        with pytest.raises(InputError, match="write it with idesplat infer"):
             write_splats(tmp_path / f"scene{suffix}", truth)
 
 
@@ -288,7 +288,7 @@ def test_the_command_goes_all_the_way_round(
     )
     assert_close(read_ply(Path("d.ply")), truth, total, in_order=False)
     assert run_command(convert, "d.ply", "e.splat") == 0
-    assert "note: spherical harmonics above degree 0 left out" in capsys.readouterr().out
+    assert "note: SH coefficients above degree 0 were left out" in capsys.readouterr().out
 
 
 def test_the_command_leaves_out_what_is_faint(
