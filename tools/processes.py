@@ -1,4 +1,4 @@
-"""What every Python process that the tools start has in common."""
+"""Starting Python processes from the tools."""
 
 import os
 from collections.abc import Iterator
@@ -9,9 +9,9 @@ SAFE_PATH = "PYTHONSAFEPATH"
 
 @contextmanager
 def safe_path() -> Iterator[None]:
-    """Keep the Python processes that start meanwhile from importing modules of the current folder.
+    """Python processes that start inside this context do not import modules from the current folder.
 
-    multiprocessing starts them, and its resource tracker, without an option for that.
+    They get PYTHONSAFEPATH, since multiprocessing starts processes and its resource tracker without `-P`.
     """
     before = os.environ.get(SAFE_PATH)
     os.environ[SAFE_PATH] = "1"

@@ -4,7 +4,6 @@ python -P -m idesplat.tools.benchmark.components
 """
 
 import sys
-import tempfile
 import time
 from contextlib import ExitStack
 from importlib.util import find_spec
@@ -19,6 +18,7 @@ from rich.table import Table
 from ...runtime.cli.terminal import run
 from ...runtime.geometry.intrinsics import intrinsic_matrix
 from ...runtime.inference.session import usable_cores
+from ...runtime.system.files import scratch_folder
 from .runner import SETTLE_SECONDS, thread_environment
 from .worker import Prepared, Worker
 
@@ -39,10 +39,10 @@ def main(repeats: Annotated[int, typer.Option(help="Rounds.", min=1)] = 9) -> No
     rasterizers: Candidates = {"NumPy": (rasterizer, False)}
     if find_spec("numba"):
         rasterizers["compiled (numba)"] = (rasterizer, True)
-    with thread_environment(usable_cores()), tempfile.TemporaryDirectory() as folder:
+    with thread_environment(usable_cores()), scratch_folder() as folder:
         run_interleaved(f"{RENDERED_SPLATS:,} splats a pixel wide at {SIDE}x{SIDE}", rasterizers, repeats)
-        run_interleaved(f"writing {FILE_SPLATS:,} splats, SH degree 2", _files(Path(folder), "write"), repeats)
-        run_interleaved(f"reading {FILE_SPLATS:,} splats, SH degree 2", _files(Path(folder), "read"), repeats)
+        run_interleaved(f"writing {FILE_SPLATS:,} splats, SH degree 2", _files(folder, "write"), repeats)
+        run_interleaved(f"reading {FILE_SPLATS:,} splats, SH degree 2", _files(folder, "read"), repeats)
 
 
 def run_interleaved(title: str, candidates: Candidates, repeats: int) -> None:

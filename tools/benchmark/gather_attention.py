@@ -3,10 +3,8 @@
 python -P -m idesplat.tools.benchmark.gather_attention
 """
 
-import tempfile
 import warnings
 from contextlib import nullcontext
-from pathlib import Path
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -19,6 +17,7 @@ from torch import Tensor, nn
 from ...export.graph.gather_loops import FEW, chunked, lower_custom_ops
 from ...model.common.gather_attention import GatherAttention
 from ...runtime.cli.terminal import run
+from ...runtime.system.files import scratch_folder
 from .components import run_interleaved
 from .runner import thread_environment
 from .worker import Prepared
@@ -99,9 +98,9 @@ class Both(nn.Module):
 def exported(block: int, arrays: tuple[np.ndarray, ...], in_chunks: bool) -> onnx.ModelProto:
     """`Both` as a graph with dynamic numbers of pairs and pixels."""
     network = Both(block)
-    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+    with scratch_folder() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # deprecation of the path, and tracing warnings
-        path = Path(folder) / "both.onnx"
+        path = folder / "both.onnx"
         tensors = tuple(torch.from_numpy(array) for array in arrays)
         with chunked(network) if in_chunks else nullcontext():
             torch.onnx.export(

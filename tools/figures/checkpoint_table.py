@@ -10,7 +10,6 @@ pixels are then uncorrelated. Seconds are CPU time of one thread, which does not
 
 import math
 import os
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,6 +27,7 @@ from ...runtime.cli.terminal import run, say
 from ...runtime.errors import InputError
 from ...runtime.inference.normalization import SceneNormalization
 from ...runtime.inference.session import CPU
+from ...runtime.system.files import scratch_folder
 from ..benchmark.runner import thread_environment
 from ..benchmark.worker import Failed, Prepared, Worker, Workload, example_arrays, exported
 
@@ -125,8 +125,8 @@ def measure(preset: str, repeats: int) -> Measured:
     """Write a checkpoint with random weights, export it and run the graph. Raises Failed if that fails."""
     config = PRESETS[preset]
     workload = Workload(VIEWS, config.height, config.width)
-    with tempfile.TemporaryDirectory() as folder:
-        checkpoint, model = Path(folder) / "random.pth", Path(folder) / "model.onnx"
+    with scratch_folder() as folder:
+        checkpoint, model = folder / "random.pth", folder / "model.onnx"
         with Worker(reference, preset, checkpoint, workload) as worker:
             parameters, depth = worker.about
         with Worker(exporting, checkpoint, preset, model) as worker:
@@ -136,7 +136,7 @@ def measure(preset: str, repeats: int) -> Measured:
             seconds = float(np.median([worker.run().result for _ in range(repeats)]))
             error = np.abs(worker.about["depth"] - depth) / depth
             peak = worker.finish()
-        size = sum(path.stat().st_size for path in Path(folder).glob("model.onnx*"))
+        size = sum(path.stat().st_size for path in folder.glob("model.onnx*"))
     share, median = float((error <= TOLERANCE).mean()), float(np.median(error))
     return Measured(parameters, share, median, seconds, peak or 0, size, export_seconds, export_peak or 0)
 

@@ -3,9 +3,7 @@
 python -P -m idesplat.tools.figures.compare_formats --gaussians 131072
 """
 
-import tempfile
 import time
-from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -16,6 +14,7 @@ from ...runtime.geometry.intrinsics import intrinsic_matrix
 from ...runtime.rendering.render import render_view
 from ...runtime.splats.gaussians import Gaussians
 from ...runtime.splats.io import FORMATS, read_splats, write_splats
+from ...runtime.system.files import scratch_folder
 from ..evaluation.metrics import psnr
 
 VIEWS = 2
@@ -52,9 +51,9 @@ def compare(gaussians: Annotated[int, typer.Option(help="How many.", min=100)] =
     scene = example_scene(gaussians)
     rendered = _render(scene)
     say(f"{len(scene):,} Gaussians", f"{'format':16}{'write, s':>10}{'read, s':>10}{'MB':>8}{'PSNR, dB':>10}")
-    with tempfile.TemporaryDirectory() as folder:
+    with scratch_folder() as folder:
         for suffix in FORMATS:
-            path = Path(folder) / f"scene{suffix}"
+            path = folder / f"scene{suffix}"
             started = time.process_time()
             write_splats(path, scene)
             written = time.process_time()

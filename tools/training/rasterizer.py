@@ -1,7 +1,9 @@
-"""A differentiable rasteriser of Gaussians for training, on the CPU: gsplat's semantics, gradients to every input.
+"""A differentiable rasteriser of Gaussians for training on a CPU, with gsplat's semantics and gradients for all inputs.
 
-Projection and spherical harmonics are plain torch. Compositing is compiled: the splats are visited front to back, each
-adds to the pixels of its box, and the way back visits them in the opposite order. Nothing is kept per fragment.
+Projection (`geometry.projection`) and spherical harmonics (`geometry.sh`) are in PyTorch, compositing
+(`rendering.types`) is compiled with numba: splats are visited front to back, and each is composited over the pixels of
+its bounding box. The backward pass visits them back to front. Nothing is stored per fragment: with T the transmittance
+behind a splat, that before it is T / (1 - alpha).
 """
 
 import functools
@@ -41,7 +43,7 @@ def rasterize(
     means: world units, [gaussians, 3]. quats: wxyz, of any length but zero, [gaussians, 4]. scales: world units,
     [gaussians, 3]. opacities: in [0, 1], [gaussians]. sh: degree 0 to 3, [gaussians, (degree + 1)^2, 3].
     viewmat: world-to-camera, OpenCV axes, [4, 4]. K: pixels, pixel centres at .5, [3, 3]. background: [3].
-    depth is the z-depth weighted as colour is, and not divided by alpha. All in one float type, on the CPU.
+    depth: sum of z-depth with the weights of color, not divided by alpha. All tensors have one float type, on the CPU.
     """
     camera_means = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     seen = torch.nonzero(camera_means.detach()[:, 2] > NEAR)[:, 0]
@@ -49,8 +51,8 @@ def rasterize(
         camera_means, means, quats = camera_means[seen], means[seen], quats[seen]
         scales, opacities, sh = scales[seen], opacities[seen], sh[seen]
     centres, conics = _project(camera_means, quats, scales, viewmat, K, width, height)
-    colours = _colours(sh, means, -viewmat[:3, :3].T @ viewmat[:3, 3])
-    values = torch.cat([colours, camera_means[:, 2:]], dim=-1)  # [gaussians, 4]
+    colors = _colors(sh, means, -viewmat[:3, :3].T @ viewmat[:3, 3])
+    values = torch.cat([colors, camera_means[:, 2:]], dim=-1)  # [gaussians, 4]
     image, transmittance = _Composite.apply(centres, conics, opacities, values, width, height)
     return image[..., :3] + transmittance[..., None] * background, 1 - transmittance, image[..., 3]
 
@@ -64,15 +66,15 @@ def _project(
     width: int,
     height: int,
 ) -> tuple[Tensor, Tensor]:
-    """The splats' centres in pixels [gaussians, 2] and inverse covariances (xx, xy, yy) [gaussians, 3]."""
+    """Means in pixels [gaussians, 2] and inverse 2D covariances (xx, xy, yy) [gaussians, 3]."""
     x, y, z = camera_means.unbind(-1)
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     centres = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
-    slack_x, slack_y = FOV_MARGIN * 0.5 * width / fx, FOV_MARGIN * 0.5 * height / fy
-    slope_x = torch.clamp(x / z, -cx / fx - slack_x, (width - cx) / fx + slack_x)
-    slope_y = torch.clamp(y / z, -cy / fy - slack_y, (height - cy) / fy + slack_y)
+    margin_x, margin_y = FOV_MARGIN * 0.5 * width / fx, FOV_MARGIN * 0.5 * height / fy
+    slope_x = torch.clamp(x / z, -cx / fx - margin_x, (width - cx) / fx + margin_x)
+    slope_y = torch.clamp(y / z, -cy / fy - margin_y, (height - cy) / fy + margin_y)
     rotation = viewmat[:3, :3]
-    # The projection's Jacobian times the camera's rotation, row by row, [gaussians, 3].
+    # Rows of J W, [gaussians, 3].
     row_u = (fx / z)[:, None] * (rotation[0] - slope_x[:, None] * rotation[2])
     row_v = (fy / z)[:, None] * (rotation[1] - slope_y[:, None] * rotation[2])
     axes = _scaled_axes(quats, scales)  # [gaussians, 3, 3]
@@ -86,7 +88,7 @@ def _project(
 
 
 def _scaled_axes(quats: Tensor, scales: Tensor) -> Tensor:
-    """The Gaussians' axes in the world as columns, each as long as its scale, [gaussians, 3, 3]."""
+    """R S: rotation matrices times scales, [gaussians, 3, 3]."""
     w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
     rotation = torch.stack(
         [
@@ -99,8 +101,8 @@ def _scaled_axes(quats: Tensor, scales: Tensor) -> Tensor:
     return rotation.view(-1, 3, 3) * scales[:, None, :]
 
 
-def _colours(sh: Tensor, means: Tensor, camera: Tensor) -> Tensor:
-    """Colour of the Gaussians as seen from `camera` [3], [gaussians, 3]."""
+def _colors(sh: Tensor, means: Tensor, camera: Tensor) -> Tensor:
+    """Color of the Gaussians seen from the camera centre [3], [gaussians, 3]."""
     count = sh.shape[1]
     if count == 1:
         return torch.clamp_min(SH_0 * sh[:, 0] + 0.5, 0)
@@ -121,13 +123,13 @@ def _colours(sh: Tensor, means: Tensor, camera: Tensor) -> Tensor:
 
 
 class _Composite(torch.autograd.Function):
-    """Front-to-back compositing of splats: values [height, width, 4] and the transmittance left [height, width]."""
+    """Front-to-back compositing of splats: values [height, width, 4] and final transmittance [height, width]."""
 
     @staticmethod
     def forward(
         ctx: Any, centres: Tensor, conics: Tensor, opacities: Tensor, values: Tensor, width: int, height: int
     ) -> tuple[Tensor, Tensor]:
-        """centres [splats, 2], conics [splats, 3], opacities [splats], values [splats, 4], the last of them depth."""
+        """centres [splats, 2], conics [splats, 3], opacities [splats], values [splats, 4]: color and z-depth."""
         parts = (centres, conics, opacities, values)
         xy, q, o, v = (np.ascontiguousarray(part.detach().numpy()) for part in parts)
         order = np.argsort(v[:, 3], kind="stable")
@@ -154,7 +156,7 @@ class _Composite(torch.autograd.Function):
 def _box(
     centres: np.ndarray, conics: np.ndarray, opacity: float, splat: int, width: int, height: int
 ) -> tuple[int, int, int, int]:
-    """The pixels (columns from, to, rows from, to) where the splat's alpha can reach MIN_ALPHA."""
+    """The bounding box of alpha >= MIN_ALPHA in pixels: first and end column, first and end row."""
     reach = 2 * np.log(opacity / MIN_ALPHA)
     if not reach > 0:
         return 0, 0, 0, 0
@@ -182,9 +184,9 @@ def _composite(
     transmittance: np.ndarray,
     last: np.ndarray,
 ) -> None:
-    """Add the splats in `order` to `image`; `last`: the place in `order` of each pixel's last splat.
+    """Composite the splats in `order` into `image`. last: the position in `order` of each pixel's last splat.
 
-    A pixel that is full has `transmittance` negated until all is done.
+    Until the end, the transmittance of a pixel that is finished is stored negated.
     """
     height, width = transmittance.shape
     for place in range(len(order)):
@@ -232,11 +234,15 @@ def _composite_backward(
     opacity_gradients: np.ndarray,
     value_gradients: np.ndarray,
 ) -> None:
-    """Fill the gradients, back to front: the transmittance before a splat is that behind it divided by 1 - alpha."""
+    """Accumulate the gradients, back to front.
+
+    For splat i of a pixel with values v_i, and g the gradient of the pixel's values:
+
+        dL/dalpha_i = T_i d_i - B_i / (1 - alpha_i),    d_i = v_i . g,    B_i = sum_{j > i} d_j alpha_j T_j + T dL/dT.
+    """
     height, width = transmittance.shape
-    through = transmittance.astype(np.float64)  # behind the splat at hand
-    # What a unit of light behind the splat at hand is worth, times `through`.
-    behind = transmittance_gradient * through
+    transmittance_behind = transmittance.astype(np.float64)  # T behind the current splat
+    behind = transmittance_gradient * transmittance_behind  # B of the current splat
     for place in range(len(order) - 1, -1, -1):
         splat = order[place]
         left, right, top, bottom = _box(centres, conics, opacities[splat], splat, width, height)
@@ -248,21 +254,21 @@ def _composite_backward(
                     continue
                 dx = column + 0.5 - centres[splat, 0]
                 sigma = 0.5 * (xx * dx * dx + yy * dy * dy) + xy * dx * dy
-                fall = np.exp(-sigma)
-                alpha = min(MAX_ALPHA, opacity * fall)
+                falloff = np.exp(-sigma)
+                alpha = min(MAX_ALPHA, opacity * falloff)
                 if alpha < MIN_ALPHA:
                     continue
-                before = through[row, column] / (1 - alpha)
-                worth = 0.0
+                before = transmittance_behind[row, column] / (1 - alpha)
+                dot = 0.0
                 for channel in range(4):
                     value_gradients[splat, channel] += alpha * before * image_gradient[row, column, channel]
-                    worth += values[splat, channel] * image_gradient[row, column, channel]
-                alpha_gradient = before * worth - behind[row, column] / (1 - alpha)
-                behind[row, column] += alpha * before * worth
-                through[row, column] = before
-                if opacity * fall >= MAX_ALPHA:
+                    dot += values[splat, channel] * image_gradient[row, column, channel]
+                alpha_gradient = before * dot - behind[row, column] / (1 - alpha)
+                behind[row, column] += alpha * before * dot
+                transmittance_behind[row, column] = before
+                if opacity * falloff >= MAX_ALPHA:
                     continue
-                opacity_gradients[splat] += fall * alpha_gradient
+                opacity_gradients[splat] += falloff * alpha_gradient
                 sigma_gradient = -alpha * alpha_gradient
                 conic_gradients[splat, 0] += 0.5 * dx * dx * sigma_gradient
                 conic_gradients[splat, 1] += dx * dy * sigma_gradient

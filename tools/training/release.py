@@ -1,8 +1,8 @@
-"""Make a trained checkpoint the bundled model.
+"""Export a trained checkpoint as the bundled model.
 
     python -P -m idesplat.tools.training.release runs/tiny/last.ckpt
 
-Exports it, verified, to `runtime/inference/bundled/`, and writes its checksum beside it.
+The verified ONNX graph goes to `runtime/inference/bundled/`, with its checksum.
 """
 
 import hashlib
@@ -20,7 +20,7 @@ PRESET = "idesplat-tiny"
 
 
 def release_bundled_model(
-    checkpoint: Annotated[Path, typer.Argument(help="What idesplat train wrote.", show_default=False)],
+    checkpoint: Annotated[Path, typer.Argument(help="Checkpoint that `idesplat train` wrote.", show_default=False)],
     preset: Annotated[str, typer.Option(help="The network.")] = PRESET,
 ) -> None:
     """Export a checkpoint as the bundled model."""
