@@ -1,4 +1,4 @@
-"""The benchmark: what it counts, what it says, how it fails. No test here depends on how long anything takes."""
+"""The benchmark: counts, reports and failures. No assertion is on wall time."""
 
 import json
 import os
@@ -32,7 +32,7 @@ USUAL = ("--sizes", "64x96", "--repeats", "2", "--threads", "1")
 
 @pytest.fixture(scope="module")
 def measured(exported, tmp_path_factory) -> tuple[Path, str]:
-    """What the command writes and prints for the same network in one file and in stages."""
+    """The JSON and the output of the command for the same network in one file and in stages."""
     path = tmp_path_factory.mktemp("bench") / "bench.json"
     command = [sys.executable, "-m", "idesplat.tools.benchmark.cli", *map(str, exported), *USUAL, "--json", str(path)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=600)
@@ -69,8 +69,8 @@ def test_the_same_network_in_stages_computes_the_same(measured):
     assert staged.depth_error < 1e-3
 
 
-def test_flop_are_those_that_pytorch_counts(measured):
-    """PyTorch counts what it executes; the graph adds the resizing of position embeddings, which is a product there."""
+def test_flop_agree_with_pytorchs_counter(measured):
+    """PyTorch counts executed operators; the graph adds the resizing of position embeddings, a matmul there."""
     import torch
     from idesplat.model.idesplat.network import IDESplat
     from torch.utils.flop_counter import FlopCounterMode
@@ -81,7 +81,7 @@ def test_flop_are_those_that_pytorch_counts(measured):
     assert read_rows(measured[0])[0].flop == pytest.approx(counter.get_total_flops(), rel=0.02)
 
 
-def test_flop_of_operators_worked_by_hand(tmp_path):
+def test_flop_of_operators_by_hand(tmp_path):
     rng = np.random.default_rng(0)
 
     def weight(name: str, *shape: int):
@@ -118,13 +118,13 @@ def test_flop_of_operators_worked_by_hand(tmp_path):
     }
 
 
-def test_networks_run_in_pytorch():
+def test_a_preset_runs_in_eager_pytorch():
     about, run = eager("idesplat-tiny", 1, Workload(2, 64, 64))
     assert about["load_seconds"] > 0
     assert run() is None
 
 
-def test_the_machine_is_measured():
+def test_the_gemm_reference_gives_flop_per_second():
     _, run = gemm()
     assert run() > 1e8
 
@@ -144,7 +144,7 @@ def dying() -> tuple:
     return None, lambda: os._exit(9)
 
 
-def test_each_process_has_memory_of_its_own():
+def test_each_process_has_its_own_peak_memory():
     with Worker(holding, 1) as small, Worker(holding, 300) as large:
         assert (small.run().result, large.run().result) == (1 << 17, 300 << 17)
         more = large.finish() - small.finish()
@@ -183,12 +183,12 @@ def a_row(**changes) -> Row:
         ({"seconds": [9.0] * 4, "views": 3}, []),  # another workload
     ],
 )
-def test_what_became_worse_by_more_than_noise(changes, expected):
+def test_regressions_are_beyond_noise(changes, expected):
     row = a_row(**changes)
     assert compare([row], [a_row()]) == [f"{row.name}: {verdict}" for verdict in expected]
 
 
-def test_a_small_steady_loss_is_within_tolerance():
+def test_a_small_steady_slowdown_is_within_tolerance():
     assert compare([a_row(seconds=[1.03] * 4)], [a_row(seconds=[1.0] * 4)]) == []
     assert len(compare([a_row(seconds=[1.07] * 4)], [a_row(seconds=[1.0] * 4)])) == 1
 
@@ -203,7 +203,7 @@ def test_rows_survive_their_file(tmp_path):
 
 
 def test_the_command_compares(exported, measured, tmp_path, capsys):
-    """The older run was ten thousand times faster, or slower, than any machine makes up for."""
+    """The earlier run was ten thousand times faster, or slower, so that noise cannot matter."""
     older = tmp_path / "older.json"
     for factor, status in ((1e-4, 1), (1e4, 0)):
         rows = [replace(row, seconds=[time * factor for time in row.seconds]) for row in read_rows(measured[0])]
@@ -217,7 +217,7 @@ def test_the_command_compares(exported, measured, tmp_path, capsys):
 # ---- ends
 
 
-def test_what_is_done_when_it_is_interrupted_is_kept(exported, tmp_path, monkeypatch, capsys):
+def test_finished_workloads_survive_an_interrupt(exported, tmp_path, monkeypatch, capsys):
     def one_and_stop(candidates, workload, settings, on_status):
         if workload.views == 4:
             raise KeyboardInterrupt
@@ -231,7 +231,7 @@ def test_what_is_done_when_it_is_interrupted_is_kept(exported, tmp_path, monkeyp
     assert "interrupted" in capsys.readouterr().err
 
 
-def test_where_nothing_can_be_measured_it_says_why(exported, capsys):
+def test_the_reason_is_printed_when_nothing_can_be_measured(exported, capsys):
     assert run_command(bench.main, exported[0], "--sizes", "64x50", "--repeats", "1", "--no-eager") == 2
     printed = capsys.readouterr().err
     assert "multiples of 16" in printed
@@ -249,7 +249,7 @@ def test_where_nothing_can_be_measured_it_says_why(exported, capsys):
         (("--compare", "nowhere.json"), "nowhere.json: cannot be read"),
     ],
 )
-def test_bad_input_gets_one_line(arguments, expected, tmp_path, monkeypatch, capsys):
+def test_invalid_input_is_one_line(arguments, expected, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert run_command(bench.main, *arguments) == 2
     printed = capsys.readouterr().err
@@ -279,7 +279,7 @@ def test_a_failing_training_benchmark_is_one_line():
     assert "\n" not in str(error.value)
 
 
-def test_environment_is_left_as_it_was(monkeypatch):
+def test_the_environment_is_restored(monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
     with runner.thread_environment(3):

@@ -1,4 +1,4 @@
-"""The methods beside the model: a plane's images are known exactly, so best plane and true depth must draw them."""
+"""Baselines, on images of a plane that are known exactly: best plane and oracle-depth splats must reproduce them."""
 
 from dataclasses import replace
 
@@ -55,7 +55,7 @@ def inner(image: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("near", "far"), [(0.5, 100.0), (2.0, 9.0), (5.0, 9.0), (1.0, 3.0)])
-def test_finds_the_plane_that_all_is_on(near: float, far: float) -> None:
+def test_best_plane_of_a_wall_is_the_wall(near: float, far: float) -> None:
     context, target = posed(CONTEXT), posed([STRAIGHT])
     everywhere = np.ones((HEIGHT, WIDTH), bool)
     image, depth = best_fronto_parallel_plane(context, target.image(0), everywhere, STRAIGHT, target.K(0), near, far)
@@ -66,7 +66,7 @@ def test_finds_the_plane_that_all_is_on(near: float, far: float) -> None:
     assert np.abs(inner(copied) - inner(target.image(0))).max() > 0.3
 
 
-def test_pixels_that_do_not_count_do_not_decide() -> None:
+def test_best_plane_ignores_invalid_pixels() -> None:
     context, target = posed(CONTEXT), posed([STRAIGHT])
     valid = np.ones((HEIGHT, WIDTH), bool)
     valid[:, : WIDTH // 2] = False
@@ -75,7 +75,7 @@ def test_pixels_that_do_not_count_do_not_decide() -> None:
     assert depth == pytest.approx(DEPTH, rel=5e-3)
 
 
-def test_what_a_view_did_not_see_is_taken_from_another() -> None:
+def test_warp_takes_invalid_pixels_from_another_view() -> None:
     context = posed(CONTEXT)
     context.images[0][:, :, 20:60] = 0
     context.valid[0][:, 20:60] = False
@@ -86,12 +86,12 @@ def test_what_a_view_did_not_see_is_taken_from_another() -> None:
     assert close.mean() > 0.9
 
 
-def test_a_view_at_the_target_is_shown_as_it_is() -> None:
+def test_warp_of_a_view_at_the_target_is_that_view() -> None:
     context = posed([CONTEXT[0], STRAIGHT])
     np.testing.assert_allclose(warp_plane(context, STRAIGHT, context.K(1), 0.7), context.image(1), atol=1e-4)
 
 
-def test_the_nearest_view_fills_what_none_sees() -> None:
+def test_warp_copies_the_nearest_view_where_none_sees() -> None:
     behind = [look_at(np.array([x, 0.0, 0.0]), np.array([0.0, 0.1, -5.0])) for x in (0.3, -0.2)]
     context = posed(behind)
     assert nearest_view(context, STRAIGHT) == 1
@@ -99,7 +99,7 @@ def test_the_nearest_view_fills_what_none_sees() -> None:
 
 
 @pytest.mark.slow
-def test_no_plane_of_a_dense_sweep_is_better(scene) -> None:
+def test_best_plane_is_as_good_as_a_dense_sweep(scene) -> None:
     """On a furnished room, where no plane fits."""
     frames = match_images_to_cameras(find_images([scene / "images"]), read_cameras(scene / "transforms.json"))
     case = load_case(frames, [1, 3], [2], (64, 96), lambda views: DepthRange(0.5, 100.0, "guessed"))
@@ -119,17 +119,17 @@ def wall_depth(pose: np.ndarray) -> np.ndarray:
     return (DEPTH - pose[2, 3]) / rays[..., 2]
 
 
-def test_splats_at_the_true_depth_draw_the_wall() -> None:
+def test_oracle_depth_splats_render_the_wall() -> None:
     context, target = posed(CONTEXT), posed([STRAIGHT])
     depth = np.stack([wall_depth(pose) for pose in CONTEXT])
     np.testing.assert_allclose(unproject(depth[:1], context.extrinsics[:1], context.intrinsics[:1])[..., 2], DEPTH)
-    drawn = render_target(oracle_depth_splats(depth, context), target, 0)
-    np.testing.assert_allclose(inner(drawn.rgb), inner(target.image(0)), atol=0.05)
+    rendered = render_target(oracle_depth_splats(depth, context), target, 0)
+    np.testing.assert_allclose(inner(rendered.rgb), inner(target.image(0)), atol=0.05)
     off = render_target(oracle_depth_splats(1.5 * depth, context), target, 0)
     assert np.abs(inner(off.rgb) - inner(target.image(0))).max() > 0.15
 
 
-def test_seen_is_what_no_surface_hides_and_no_border_cuts_off() -> None:
+def test_covisible_points_are_neither_occluded_nor_outside_the_image() -> None:
     views = posed([STRAIGHT])
     depth = np.full((1, HEIGHT, WIDTH), DEPTH)
     depth[0, :, : WIDTH // 2] = DEPTH / 2  # a nearer surface on the left
@@ -152,15 +152,15 @@ def test_seen_is_what_no_surface_hides_and_no_border_cuts_off() -> None:
     np.testing.assert_array_equal(find_covisible(points, depth, views), [list(expected.values())])
 
 
-def test_splats_seen_closer_want_to_be_larger() -> None:
-    """At the true depth 0.3 pixels beat 0.45 as large as the images, and leave gaps four times as large."""
+def test_zoomed_views_need_larger_splats() -> None:
+    """Splats of 0.3 pixels score higher than 0.45 at the images' size, and leave gaps at a zoom of four."""
     better = {}
-    for closer in (1, 4):
-        case = synthetic_case(HELD_OUT_SEEDS[1], 2, 2, 1, 128, 128, closer)
+    for zoom in (1, 4):
+        case = synthetic_case(HELD_OUT_SEEDS[1], 2, 2, 1, 128, 128, zoom)
         rule = oracle_depth_splats(case.depth, case.context)
         small, large = (replace(rule, scales=rule.scales * np.float32(pixels / SPLAT_PIXELS)) for pixels in (0.3, 0.45))
         truth, seen = case.targets.image(0), case.covisible[0]
-        better[closer] = np.subtract(
+        better[zoom] = np.subtract(
             *(psnr(render_target(scene, case.targets, 0).rgb, truth, seen) for scene in (large, small))
         )
         assert psnr(render_target(large, case.targets, 0).rgb, truth, seen) > 20

@@ -1,4 +1,4 @@
-"""Real captures: their file, checkouts of their repositories, and the command that measures a model on them."""
+"""Real captures: their file, checkouts of their repositories, and the command that evaluates a model on them."""
 
 import json
 import shutil
@@ -107,7 +107,7 @@ def test_windows_of_more_views_contain_the_smaller_ones() -> None:
         assert capture.window(len(capture.views) + 1) == ([], [])
 
 
-def test_cameras_come_back_from_the_file(capture_file: Path, scene: Path) -> None:
+def test_cameras_survive_their_file(capture_file: Path, scene: Path) -> None:
     (capture,) = read_captures()
     for camera in read_cameras(scene / "transforms.json"):
         again = capture.cameras[Path(camera.name).name]
@@ -150,7 +150,7 @@ def test_missing_checkouts_are_cloned_once(repository: tuple[Path, str], tmp_pat
     assert [path.name for path in folder.iterdir()] == ["someone+photos"]
 
 
-def test_a_failed_clone_is_one_line_and_leaves_nothing(repository: tuple[Path, str], tmp_path: Path) -> None:
+def test_a_failed_clone_is_one_line_and_leaves_no_files(repository: tuple[Path, str], tmp_path: Path) -> None:
     with pytest.raises(InputError, match="git fetch failed") as error:
         fetch_checkout(tmp_path, REPOSITORY, repository[1], f"file://{tmp_path}/nowhere")
     assert "\n" not in str(error.value) and not list(tmp_path.iterdir())
@@ -162,7 +162,7 @@ def test_a_failed_clone_is_one_line_and_leaves_nothing(repository: tuple[Path, s
         fetch_checkout(tmp_path, REPOSITORY, "0" * 40, host)
 
 
-def test_git_that_is_not_installed_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_git_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(InputError, match="git is needed"):
         fetch_checkout(tmp_path / "checkouts", REPOSITORY, "0" * 40)
@@ -204,7 +204,7 @@ def measured(
     return json.loads(Path("out/results.json").read_text()), opened
 
 
-def test_the_command_measures_what_the_library_gives(
+def test_the_command_gives_the_metrics_of_the_predictor_used_by_hand(
     measured: tuple[dict[str, Any], Predictor], scene: Path, capsys: Capsys
 ) -> None:
     content, opened = measured
@@ -253,7 +253,7 @@ def test_the_command_measures_what_the_library_gives(
     assert "mean of 1" in printed and "wrote out/results.json" in printed
 
 
-def test_what_the_lens_did_not_see_is_not_counted(capture_file: Path, scene: Path) -> None:
+def test_pixels_outside_the_lens_image_are_invalid(capture_file: Path, scene: Path) -> None:
     content = json.loads(capture_file.read_text())
     content["captures"][0]["lenses"][0]["distortion"] = [0.3, 0.0, 0.0, 0.0]  # the corners lie outside
     capture_file.write_text(json.dumps(content))
@@ -264,7 +264,7 @@ def test_what_the_lens_did_not_see_is_not_counted(capture_file: Path, scene: Pat
     assert 0.5 < case.targets.valid.mean() < 0.99
 
 
-def spoiled(field: str, value: object) -> str:
+def changed(field: str, value: object) -> str:
     content = json.loads(captures.CAPTURES_FILE.read_text())
     content["captures"][0][field] = value
     return json.dumps(content)
@@ -274,10 +274,10 @@ BAD_FILES = {
     "not JSON": (lambda: "{", "not valid JSON"),
     "another file": (lambda: '{"format": "other"}', "update idesplat"),
     "no captures": (lambda: '{"format": "idesplat-captures", "version": 1, "captures": []}', "at least one"),
-    "no lens": (lambda: spoiled("lenses", []), "room: is not as this version writes it"),
-    "a frame without camera": (lambda: spoiled("triples", [["000.png", "004.png", "x.png"]]), "x.png: no camera"),
-    "a context frame held out": (lambda: spoiled("triples", [["000.png"] * 3]), "is context and target"),
-    "a view held out": (lambda: spoiled("between", NAMES[:2]), "none of them a view"),
+    "no lens": (lambda: changed("lenses", []), "room: is not as this version writes it"),
+    "a frame without camera": (lambda: changed("triples", [["000.png", "004.png", "x.png"]]), "x.png: no camera"),
+    "a context frame held out": (lambda: changed("triples", [["000.png"] * 3]), "is context and target"),
+    "a view held out": (lambda: changed("between", NAMES[:2]), "none of them a view"),
 }
 
 

@@ -1,4 +1,4 @@
-"""The released datasets' files: a chunk and an index made here, and everything that can be wrong with them."""
+"""Chunks and evaluation indices of the released datasets: valid ones, and damaged or malformed ones."""
 
 import pickle
 from collections.abc import Callable
@@ -77,7 +77,7 @@ def test_reads_a_published_index(tmp_path: Path) -> None:
         ('{"a": [0, 1]}', "a: expected"),
     ],
 )
-def test_refuses_what_is_no_index(content: str, expected: str, tmp_path: Path) -> None:
+def test_refuses_files_that_are_no_index(content: str, expected: str, tmp_path: Path) -> None:
     path = tmp_path / "index.json"
     path.write_text(content)
     with pytest.raises(InputError, match=expected) as error:
@@ -85,7 +85,7 @@ def test_refuses_what_is_no_index(content: str, expected: str, tmp_path: Path) -
     assert str(path) in str(error.value) and "\n" not in str(error.value)
 
 
-def test_finds_chunks_or_says_where(folder: Path, tmp_path: Path) -> None:
+def test_finds_chunks_or_names_the_folder_that_has_them(folder: Path, tmp_path: Path) -> None:
     assert [path.name for path in find_chunks(folder)] == ["000000.torch", "000001.torch"]
     root = tmp_path / "dataset"
     root.mkdir()
@@ -99,8 +99,8 @@ def test_finds_chunks_or_says_where(folder: Path, tmp_path: Path) -> None:
         find_chunks(root / "train")
 
 
-class Mischief:
-    """What a pickle file can do when it is loaded without care."""
+class MaliciousPickle:
+    """An object whose pickle runs code when it is loaded without restrictions."""
 
     def __init__(self, victim: Path) -> None:
         self.victim = victim
@@ -111,8 +111,8 @@ class Mischief:
 
 def test_never_runs_code(tmp_path: Path) -> None:
     victim, torch_file, pickle_file = tmp_path / "victim", tmp_path / "0.torch", tmp_path / "1.torch"
-    torch.save([{"key": Mischief(victim)}], torch_file)
-    pickle_file.write_bytes(pickle.dumps([Mischief(victim)]))
+    torch.save([{"key": MaliciousPickle(victim)}], torch_file)
+    pickle_file.write_bytes(pickle.dumps([MaliciousPickle(victim)]))
     for path in (torch_file, pickle_file):
         with pytest.raises(InputError, match="damaged or holds more than data") as error:
             read_chunk(path)
@@ -138,9 +138,9 @@ BAD = {
 
 @pytest.mark.parametrize("name", BAD)
 def test_refuses_malformed_scenes(name: str, scene: Path, tmp_path: Path) -> None:
-    spoil, expected = BAD[name]
+    damage, expected = BAD[name]
     content = as_scene(scene, "a")
-    spoil(content)
+    damage(content)
     path = tmp_path / "0.torch"
     torch.save([as_scene(scene, "b"), content], path)
     with pytest.raises(InputError, match=expected) as error:
@@ -149,7 +149,7 @@ def test_refuses_malformed_scenes(name: str, scene: Path, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("content", [{"key": "a"}, [torch.zeros(3)], torch.zeros(3)])
-def test_refuses_what_is_no_list_of_scenes(content: Any, tmp_path: Path) -> None:
+def test_refuses_chunks_without_a_list_of_scenes(content: Any, tmp_path: Path) -> None:
     torch.save(content, tmp_path / "0.torch")
     with pytest.raises(InputError, match="expected a list of scenes"):
         read_chunk(tmp_path / "0.torch")
@@ -170,7 +170,7 @@ def test_an_index_of_another_dataset(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "expected"),
+    ("damage", "expected"),
     [
         (lambda scene: scene["images"].__setitem__(1, scene["images"][1][:300]), "frame 1: .*decoded"),
         (lambda scene: scene["images"].__setitem__(1, torch.zeros(99, dtype=torch.uint8)), "frame 1: .*decoded"),
@@ -179,9 +179,9 @@ def test_an_index_of_another_dataset(folder: Path) -> None:
         (lambda scene: scene["cameras"][2, :4].mul_(1000), "frame 2: .*focal"),
     ],
 )
-def test_skips_scenes_that_are_damaged(spoil: Callable, expected: str, scene: Path, tmp_path: Path) -> None:
+def test_skips_scenes_that_are_damaged(damage: Callable, expected: str, scene: Path, tmp_path: Path) -> None:
     content = as_scene(scene, "a")
-    spoil(content)
+    damage(content)
     torch.save([content, as_scene(scene, "b")], tmp_path / "0.torch")
     skipped: dict[str, str] = {}
     index = {key: IndexEntry([0, 1], [2]) for key in "ab"}
@@ -191,7 +191,7 @@ def test_skips_scenes_that_are_damaged(spoil: Callable, expected: str, scene: Pa
         raise InputError(skipped["a"])
 
 
-def test_says_that_torch_is_not_installed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_torch_is_reported(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(chunks, "find_spec", lambda package: None)
     with pytest.raises(InputError, match=r"PyTorch is needed.*pip install"):
         read_chunk(folder / "000000.torch")

@@ -1,4 +1,4 @@
-"""The command idesplat eval: its numbers against the library used by hand, and one line for what is wrong."""
+"""The command idesplat eval: its metrics against the library used by hand, and one line for invalid input."""
 
 import json
 import shutil
@@ -36,7 +36,7 @@ def opened(exported: tuple[Path, Path]) -> Predictor:
 
 @pytest.fixture
 def workplace(scene: Path, exported: tuple[Path, Path], opened: Predictor, tmp_path: Path, monkeypatch: Any) -> Path:
-    """A folder of one's own with images, cameras, depth, model, chunks and index, and we stand in it."""
+    """The current folder, with images, cameras, depth, model, chunks and index."""
     shutil.copytree(scene, tmp_path, dirs_exist_ok=True)
     shutil.copy(exported[0], tmp_path / "model.onnx")
     (tmp_path / "chunks").mkdir()
@@ -59,13 +59,13 @@ def results() -> dict[str, Any]:
     return json.loads(Path("out/results.json").read_text())
 
 
-def drawn_from(gaussians: Gaussians, pose: np.ndarray, K: np.ndarray, near: float) -> np.ndarray:
-    """The Gaussians from a camera at 64x96."""
+def rendered_from(gaussians: Gaussians, pose: np.ndarray, K: np.ndarray, near: float) -> np.ndarray:
+    """Render Gaussians from a camera at 64x96."""
     scene = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
     return rasterize(*scene, np.linalg.inv(pose.astype(np.float64)), K, 96, 64, near=near).rgb
 
 
-def test_scene_measures_what_the_library_gives(workplace: Path, opened: Predictor, capsys: Capture) -> None:
+def test_scene_gives_the_metrics_of_the_library(workplace: Path, opened: Predictor, capsys: Capture) -> None:
     assert run_command(main, *SCENE, *NAMED, "--near", "1", "--far", "20", "--depth", "depth") == 0
     cameras = read_cameras("transforms.json")
     context = [cameras[0], cameras[4]]
@@ -73,15 +73,15 @@ def test_scene_measures_what_the_library_gives(workplace: Path, opened: Predicto
     pixels, intrinsics = resize_and_crop(load_image(Path(cameras[2].name)), cameras[2].K, 64, 96)
     image = pixels.transpose(1, 2, 0)
     K = np.diag([96, 64, 1]) @ intrinsics
-    drawn = drawn_from(prediction.gaussians, cameras[2].extrinsics, K, near=0.01)
+    rendered = rendered_from(prediction.gaussians, cameras[2].extrinsics, K, near=0.01)
     content = results()
     assert content["command"] == "scene" and content["model"]["preset"] == "idesplat-small"
     (only,) = content["scenes"]
     assert only["context"] == ["000.png", "004.png"]
     assert [target["name"] for target in only["targets"]] == ["001.png", "002.png"]
     scores = only["targets"][1]["scores"]
-    psnr = -10 * np.log10(np.mean((drawn.clip(0, 1) - image) ** 2))
-    ssim = structural_similarity(drawn, image, win_size=11, gaussian_weights=True, data_range=1.0, channel_axis=2)
+    psnr = -10 * np.log10(np.mean((rendered.clip(0, 1) - image) ** 2))
+    ssim = structural_similarity(rendered, image, win_size=11, gaussian_weights=True, data_range=1.0, channel_axis=2)
     assert scores["model"]["psnr"] == pytest.approx(psnr, abs=1e-3)
     assert scores["model"]["ssim"] == pytest.approx(ssim, abs=1e-4)
     assert scores["oracle_plane"]["psnr"] > scores["nearest"]["psnr"] > 5
@@ -101,7 +101,7 @@ def test_scene_measures_what_the_library_gives(workplace: Path, opened: Predicto
     strip = cv2.imread("out/000+004-002.png")
     assert strip.shape == (64, 5 * 96 + 4 * 4, 3)
     np.testing.assert_allclose(strip[:, :96, ::-1] / 255, image, atol=0.6 / 255)
-    np.testing.assert_allclose(strip[:, 100:196, ::-1] / 255, drawn.clip(0, 1), atol=0.6 / 255)
+    np.testing.assert_allclose(strip[:, 100:196, ::-1] / 255, rendered.clip(0, 1), atol=0.6 / 255)
     printed = capsys.readouterr().out
     for text in (
         "001.png",
@@ -114,14 +114,14 @@ def test_scene_measures_what_the_library_gives(workplace: Path, opened: Predicto
         assert text in printed
 
 
-def test_scene_without_names_says_what_was_chosen(workplace: Path, capsys: Capture) -> None:
+def test_scene_without_names_prints_its_split(workplace: Path, capsys: Capture) -> None:
     assert run_command(main, *SCENE, "--views", "3") == 0
     assert "held out 000.png, inferred from 001.png, 002.png, 003.png" in capsys.readouterr().out
     (only,) = results()["scenes"]
     assert only["context"] == ["001.png", "002.png", "003.png"] and only["depth"] == {}
 
 
-def test_chunks_give_the_papers_means(workplace: Path, opened: Predictor, capsys: Capture) -> None:
+def test_chunks_are_averaged_as_in_the_papers(workplace: Path, opened: Predictor, capsys: Capture) -> None:
     assert run_command(main, *CHUNKS) == 0
     content = results()
     (only,) = content["scenes"]
@@ -135,15 +135,15 @@ def test_chunks_give_the_papers_means(workplace: Path, opened: Predictor, capsys
     given = case.context
     prediction = opened.predict_arrays(given.images, given.extrinsics, given.intrinsics, 0.5, 100.0)
     truth = case.targets.image(0)
-    # the releases draw nothing before a fifth of the near plane
-    drawn = drawn_from(prediction.gaussians, case.targets.extrinsics[0], case.targets.K(0), near=0.2 * 0.5)
-    assert values[1] == pytest.approx(-10 * np.log10(np.mean((drawn.clip(0, 1) - truth) ** 2)), abs=1e-3)
+    # the near plane of the releases' renderer
+    rendered = rendered_from(prediction.gaussians, case.targets.extrinsics[0], case.targets.K(0), near=0.2 * 0.5)
+    assert values[1] == pytest.approx(-10 * np.log10(np.mean((rendered.clip(0, 1) - truth) ** 2)), abs=1e-3)
     printed = capsys.readouterr().out
     assert "1 of the index's 2 scenes" in printed and "1 of the index's scenes are not in chunks" in printed
     assert cv2.imread("out/b-2.png").shape == (64, 4 * 96 + 3 * 4, 3)
 
 
-def test_chunks_go_on_after_a_damaged_scene(workplace: Path, scene: Path, capsys: Capture) -> None:
+def test_chunks_skip_damaged_scenes(workplace: Path, scene: Path, capsys: Capture) -> None:
     blind, still = as_scene(scene, "blind"), as_scene(scene, "still")
     blind["images"][1] = blind["images"][1][:200]
     still["cameras"][:, 6:] = still["cameras"][0, 6:].clone()
@@ -158,7 +158,7 @@ def test_chunks_go_on_after_a_damaged_scene(workplace: Path, scene: Path, capsys
     assert "skipped blind: frame 1: the image cannot be decoded" in printed and "skipped still: " in printed
 
 
-def test_procedural_scenes_have_true_depth(workplace: Path, opened: Predictor, capsys: Capture) -> None:
+def test_synthetic_scenes_have_true_depth(workplace: Path, opened: Predictor, capsys: Capture) -> None:
     assert len(HELD_OUT_SEEDS) == defaults.HELD_OUT_SCENES
     assert run_command(main, *PROCEDURAL, "--views", "3") == 0
     content = results()
@@ -177,8 +177,8 @@ def test_procedural_scenes_have_true_depth(workplace: Path, opened: Predictor, c
     assert "1 held-out synthetic scenes, 3 of 3 views, 64x96" in capsys.readouterr().out
 
 
-def test_fewer_views_of_the_same_scene() -> None:
-    """The targets stay, and of four views the first and the last are left."""
+def test_pool_views_keep_targets_and_both_ends() -> None:
+    """The targets stay the same, and of four context views the first and the last are given."""
     seed, shape = HELD_OUT_SEEDS[0], (32, 48)
     all_four, two = (synthetic_case(seed, count, 4, 1, *shape) for count in (4, 2))
     np.testing.assert_array_equal(two.targets.images, all_four.targets.images)
@@ -186,7 +186,7 @@ def test_fewer_views_of_the_same_scene() -> None:
     np.testing.assert_array_equal(two.depth, all_four.depth[[0, 3]])
 
 
-def test_lpips_takes_its_place_beside_the_others(workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lpips_is_reported_beside_the_other_metrics(workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(library, "load_lpips", lambda: lambda image, truth, valid: 0.25)
     assert run_command(main, *SCENE, *NAMED) == 0
@@ -243,12 +243,12 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_bad_input_is_one_line_and_leaves_nothing(name: str, workplace: Path, capfd: Capture) -> None:
-    spoil, arguments, expected = BAD[name]
-    spoil()
+def test_invalid_input_is_one_line_and_leaves_files_untouched(name: str, workplace: Path, capfd: Capture) -> None:
+    damage, arguments, expected = BAD[name]
+    damage()
     Path("out").mkdir()
     with Outputs("idesplat eval"), atomic_write(Path("out/results.json")) as temporary:
-        temporary.write_bytes(b"the result of yesterday")
+        temporary.write_bytes(b"an earlier result")
     before = {path: path.stat().st_mtime_ns for path in workplace.rglob("*")}
     assert run_command(main, *arguments) == 2
     lines = [line for line in capfd.readouterr().err.splitlines() if line.startswith("error: ")]
@@ -257,7 +257,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(name: str, workplace: Path, ca
     assert {path: path.stat().st_mtime_ns for path in workplace.rglob("*")} == before
 
 
-def test_procedural_scenes_need_numba(workplace: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+def test_synthetic_scenes_need_numba(workplace: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
     monkeypatch.setattr(library, "find_spec", lambda package: None)
     assert run_command(main, *PROCEDURAL) == 2
     assert "numba is needed" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Which images are held out and which are the context, and which of their pixels count."""
+"""The split of a folder of images into context and held-out views, and masks of valid pixels."""
 
 import json
 import shutil
@@ -21,7 +21,7 @@ SIZE = HEIGHT, WIDTH = 64, 96  # of images 96 x 128: scaled to 72 x 96, four row
 
 
 def find_range(views: ViewBatch) -> DepthRange:
-    """From the number of views, to know what it was asked for."""
+    """A range that tells from how many views it was estimated."""
     return DepthRange(1, 10 * len(views.names), "the test")
 
 
@@ -30,7 +30,7 @@ def frames_of(folder: Path) -> list[Frame]:
 
 
 def on_a_line(count: int) -> list[Frame]:
-    """Frames a step apart that look the same way."""
+    """Frames one unit apart with the same viewing direction."""
     K = np.array([[100.0, 0, 64], [0, 100, 48], [0, 0, 1]])
     frames = []
     for index in range(count):
@@ -79,12 +79,12 @@ def test_context_lies_around_the_target() -> None:
         ([], [], 9, "too few are left for a context of 9"),
     ],
 )
-def test_refuses(context: list[str], targets: list[str], views: int, expected: str) -> None:
+def test_refuses_splits_that_cannot_be_made(context: list[str], targets: list[str], views: int, expected: str) -> None:
     with pytest.raises(InputError, match=expected):
         split_frames(on_a_line(9), context, targets, views, 8)
 
 
-def test_pictures_as_the_runtime_prepares_them(scene: Path) -> None:
+def test_images_are_prepared_as_for_inference(scene: Path) -> None:
     frames = frames_of(scene)
     case = load_case(frames, [0, 4], [2, 1], SIZE, find_range)
     assert (case.name, case.context.names, case.targets.names) == (
@@ -102,7 +102,7 @@ def test_pictures_as_the_runtime_prepares_them(scene: Path) -> None:
     np.testing.assert_allclose(case.targets.K(0)[1, 2], 0.75 * K[1, 2] - 4, rtol=1e-6)
 
 
-def test_black_borders_do_not_count(scene: Path, tmp_path: Path) -> None:
+def test_black_borders_are_invalid(scene: Path, tmp_path: Path) -> None:
     shutil.copytree(scene, tmp_path / "scene")
     path = tmp_path / "scene" / "images" / "002.png"
     image = cv2.imread(str(path))
@@ -116,7 +116,7 @@ def test_black_borders_do_not_count(scene: Path, tmp_path: Path) -> None:
     assert case.context.valid.all()
 
 
-def test_what_the_lens_did_not_see_does_not_count(scene: Path) -> None:
+def test_pixels_outside_the_lens_image_are_invalid(scene: Path) -> None:
     frames = frames_of(scene)
     bent = [(path, replace(camera, distortion=(0.3, 0.0, 0.0, 0.0))) for path, camera in frames]
     (valid,) = load_case(bent, [0, 4], [2], SIZE, find_range).targets.valid
@@ -124,8 +124,8 @@ def test_what_the_lens_did_not_see_does_not_count(scene: Path) -> None:
 
 
 @pytest.mark.parametrize("along", ["rows", "columns"])
-def test_true_depth_at_the_pixels_of_the_network(along: str, scene: Path, tmp_path: Path) -> None:
-    """Depth that grows by one a pixel of the image tells where it was taken: within half a pixel."""
+def test_true_depth_is_sampled_at_the_networks_pixels(along: str, scene: Path, tmp_path: Path) -> None:
+    """Depth that is the pixel coordinate tells where it was sampled: within half a pixel."""
     y, x = np.meshgrid(np.arange(96) + 0.5, np.arange(128) + 0.5, indexing="ij")
     for name in ("000", "004"):
         np.savez(tmp_path / f"{name}.npz", depth=y if along == "rows" else x)
@@ -148,14 +148,14 @@ def test_refuses_depth_that_does_not_fit(scene: Path, tmp_path: Path) -> None:
         load_case(bent, [0, 4], [2], SIZE, find_range, scene / "depth")
 
 
-def test_refuses_a_black_picture(scene: Path, tmp_path: Path) -> None:
+def test_refuses_a_black_image(scene: Path, tmp_path: Path) -> None:
     shutil.copytree(scene, tmp_path / "scene")
     cv2.imwrite(str(tmp_path / "scene" / "images" / "002.png"), np.zeros((96, 128, 3), np.uint8))
     with pytest.raises(InputError, match=r"002\.png: is black"):
         load_case(frames_of(tmp_path / "scene"), [0, 4], [2], SIZE, find_range)
 
 
-def test_two_frames_at_one_pose(scene: Path, tmp_path: Path) -> None:
+def test_refuses_two_frames_at_one_pose(scene: Path, tmp_path: Path) -> None:
     shutil.copytree(scene, tmp_path / "scene")
     cameras = json.loads((scene / "transforms.json").read_text())
     cameras["frames"][2]["transform_matrix"] = cameras["frames"][0]["transform_matrix"]

@@ -1,4 +1,4 @@
-"""PSNR, SSIM, LPIPS and AbsRel, held against scikit-image and against numbers by hand."""
+"""Metrics against scikit-image, against their formulas, and against values by hand."""
 
 import sys
 
@@ -16,7 +16,7 @@ EVERYWHERE = np.ones((40, 56), bool)
 
 
 def images(seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """A image with structure at several scales, and a worse one of the same thing."""
+    """A blurred and noisy version of an image with structure at several scales, and the image."""
     rng = np.random.default_rng(seed)
     truth = sum(cv2.resize(rng.random((n, n, 3)), (56, 40), interpolation=cv2.INTER_CUBIC) for n in (3, 9, 40)) / 3
     image = cv2.GaussianBlur(truth, (5, 5), 1.2) + 0.05 * rng.standard_normal(truth.shape)
@@ -24,7 +24,7 @@ def images(seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def skimage_ssim(image: np.ndarray, truth: np.ndarray) -> tuple[float, np.ndarray]:
-    """As the releases call it, and the map."""
+    """SSIM as the releases compute it, and its map."""
     options = {"win_size": 11, "gaussian_weights": True, "data_range": 1.0, "channel_axis": 2}
     return structural_similarity(truth, image, full=True, **options)
 
@@ -59,13 +59,13 @@ def test_only_valid_pixels_count() -> None:
     valid = EVERYWHERE.copy()
     valid[:, 50:] = False
     valid[3, 2] = False
-    spoilt = np.where(valid[..., None], image, 7.0)
-    assert psnr(spoilt, truth, valid) == pytest.approx(-10 * np.log10(np.mean((image - truth)[valid] ** 2)))
+    damaged = np.where(valid[..., None], image, 7.0)
+    assert psnr(damaged, truth, valid) == pytest.approx(-10 * np.log10(np.mean((image - truth)[valid] ** 2)))
     _, similarity = skimage_ssim(image, truth)
     whole = np.zeros_like(valid)
     whole[5:35, 5:45] = True  # windows inside of the image and left of column 50 ...
     whole[5:9, 5:8] = False  # ... and off the single pixel
-    assert ssim(spoilt, truth, valid) == pytest.approx(similarity[whole].mean(), abs=1e-9)
+    assert ssim(damaged, truth, valid) == pytest.approx(similarity[whole].mean(), abs=1e-9)
     assert np.isnan(ssim(image, truth, np.zeros_like(valid)))
 
 
@@ -93,7 +93,7 @@ def test_lpips_without_its_packages_is_refused_in_one_line(package: str, monkeyp
     assert "\n" not in str(error.value)
 
 
-def test_lpips_sees_images_whose_invalid_pixels_are_true(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lpips_gets_the_truth_at_invalid_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
     def network(x: Tensor, y: Tensor, normalize: bool) -> Tensor:
         assert normalize and x.shape == y.shape == (1, 3, 4, 5)
         return (x - y).abs().sum()

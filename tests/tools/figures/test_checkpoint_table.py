@@ -1,4 +1,4 @@
-"""The table of supported checkpoints: it knows them all, and its rows are Markdown."""
+"""The table of supported checkpoints: every released preset, as rows of Markdown."""
 
 import re
 
@@ -20,7 +20,7 @@ def test_every_released_preset_has_its_row():
     )
 
 
-def test_drawn_weights_are_always_the_same_and_leave_nothing_at_its_initial_value():
+def test_random_weights_are_reproducible_and_reach_every_parameter():
     first, second = build("idesplat-tiny"), build("idesplat-tiny")
     randomize_weights(first)
     randomize_weights(second)
