@@ -33,7 +33,7 @@ class ViewEncoder(nn.Module):
         return self.vit(resize(images, rows * patch, columns * patch))
 
 
-def normalise(images: Tensor) -> Tensor:
+def normalize_images(images: Tensor) -> Tensor:
     """RGB in [0, 1] -> ImageNet's mean and deviation, [views, 3, H, W]."""
     mean = torch.tensor(IMAGENET_MEAN, dtype=images.dtype, device=images.device)[:, None, None]
     std = torch.tensor(IMAGENET_STD, dtype=images.dtype, device=images.device)[:, None, None]

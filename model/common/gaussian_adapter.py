@@ -1,4 +1,4 @@
-"""Depth and raw parameters to Gaussians in the world frame, in the usual 3DGS conventions (gaussian_adapter.py)."""
+"""Depth and raw parameters to Gaussians in the world frame, in 3DGS conventions (the releases' gaussian_adapter.py)."""
 
 from typing import NamedTuple
 
@@ -8,17 +8,17 @@ from torch import Tensor, nn
 
 from ..config import EncoderConfig
 from .geometry import Cameras, invert_intrinsics, pixel_grid
-from .quaternions import quaternion_from_matrix, quaternion_product
-from .sh import SH_C0, harmonic_rotation
+from .quaternions import matrices_to_quaternions, quaternion_product
+from .sh import SH_0, sh_rotation
 
-# The releases shift the raw scale before softplus, so that splats start at about pixel size.
+# The releases shift the raw scale before softplus, so that Gaussians start at about a pixel's size.
 SCALE_SHIFT = 4.0
-# Spherical harmonics of band l are multiplied by SH_SHARE * SH_DECAY**l, so that colour starts view-independent.
-SH_SHARE = 0.1
+# SH coefficients of degree l > 0 are multiplied by SH_WEIGHT * SH_DECAY**l, so that colour starts view-independent.
+SH_WEIGHT = 0.1
 SH_DECAY = 0.25
 QUATERNION_EPSILON = 1e-8
-# What a pixel's raw parameters begin with: opacity logit, offset x y, scales, quaternion xyzw in the camera's frame.
-# The harmonics come behind it.
+# A pixel's raw parameters: opacity logit, offset x y, scales, quaternion xyzw in the camera's frame, then the SH
+# coefficients.
 BASE_SIZES = (1, 2, 3, 4)
 BASE_PARAMETERS = sum(BASE_SIZES)
 
@@ -34,7 +34,15 @@ class WorldGaussians(NamedTuple):
 
 
 class GaussianAdapter(nn.Module):
-    """A pixel's raw parameters, as `BASE_SIZES` orders them, to its Gaussian."""
+    """A pixel's raw parameters, in the order of `BASE_SIZES`, to its Gaussian.
+
+        mean = c + depth * R K^-1 [u + sigmoid(dx), v + sigmoid(dy), 1]   (u, v: the pixel's upper left corner)
+        scale = clamp(softplus(s - 4), scale_min, scale_max), times the pixel's size at its depth if `scale_in_pixels`
+        quaternion = q(R) q,  opacity = sigmoid(logit)
+        sh = M(R) (decay * sh + [(colour - 0.5) / Y_0, 0, ...])           (`sh_rotation`)
+
+    with R and c the camera-to-world rotation and the camera centre.
+    """
 
     sh_decay: Tensor
 
@@ -43,7 +51,7 @@ class GaussianAdapter(nn.Module):
         self.scale_min, self.scale_max, self.in_pixels = config.scale_min, config.scale_max, config.scale_in_pixels
         self.coefficients, sh_degree = config.sh_coefficients, config.sh_degree
         decay = [
-            SH_SHARE * SH_DECAY**band if band else 1.0 for band in range(sh_degree + 1) for _ in range(2 * band + 1)
+            SH_WEIGHT * SH_DECAY**band if band else 1.0 for band in range(sh_degree + 1) for _ in range(2 * band + 1)
         ]
         self.register_buffer("sh_decay", torch.tensor(decay), persistent=False)
 
@@ -56,13 +64,13 @@ class GaussianAdapter(nn.Module):
         if self.in_pixels:
             scales = scales * self._pixel_sizes(depth, cameras)
         camera = cameras.extrinsics[:, :3, :3]
-        quats = quaternion_product(quaternion_from_matrix(camera)[:, None], _normalise_quaternion(rotations))
-        sh = self._world_harmonics(sh.unflatten(1, (3, self.coefficients)), (images.flatten(2) - 0.5) / SH_C0, camera)
+        quats = quaternion_product(matrices_to_quaternions(camera)[:, None], _normalise_quaternion(rotations))
+        sh = self._world_sh(sh.unflatten(1, (3, self.coefficients)), (images.flatten(2) - 0.5) / SH_0, camera)
         gaussians = WorldGaussians(means, scales, quats, logits.sigmoid()[..., 0], sh)
         return WorldGaussians(*(x.flatten(0, 1) for x in gaussians))
 
     def _means(self, offsets: Tensor, depth: Tensor, cameras: Cameras) -> Tensor:
-        """Pixels, moved by the offset within themselves, at their depth: [views, H * W, 3] in the world."""
+        """Unprojected pixels, each shifted within itself by its offset in [0, 1]: [views, H * W, 3] in the world."""
         _, height, width = depth.shape
         x, y = pixel_grid(height, width, depth)
         x = (x + offsets[..., 0]) / width  # [views, H * W]
@@ -72,21 +80,21 @@ class GaussianAdapter(nn.Module):
         return centre + rays @ rotation.transpose(1, 2) * depth.flatten(1)[..., None]
 
     def _pixel_sizes(self, depth: Tensor, cameras: Cameras) -> Tensor:
-        """What a pixel's width covers at its depth, [views, H * W, 1] in scene units."""
+        """The width of a pixel at its depth, depth / fx: [views, H * W, 1] in scene units."""
         focal = cameras.intrinsics[:, 0, 0] * depth.shape[2]
         return (depth.flatten(1) / focal[:, None])[..., None]
 
-    def _world_harmonics(self, sh: Tensor, colours: Tensor, camera: Tensor) -> Tensor:
+    def _world_sh(self, sh: Tensor, colours: Tensor, camera: Tensor) -> Tensor:
         """sh [views, 3, coefficients, H * W] as predicted, in the camera's frame -> [views, H * W, coefficients, 3].
 
-        colours: what is added to the band 0, [views, 3, H * W].
+        colours: added to degree 0, [views, 3, H * W]. camera: camera-to-world rotations, [views, 3, 3].
         """
-        # Pixels stay innermost until the end: moving three numbers at a time takes as long as several convolutions.
+        # Pixels stay innermost until the end: transposing three values at a time takes as long as several convolutions.
         sh = sh.transpose(1, 2) * self.sh_decay[:, None, None]
         sh = torch.cat([sh[:, :1] + colours[:, None], sh[:, 1:]], dim=1)
-        to_world = harmonic_rotation(camera, self.coefficients)  # [views, coefficients, coefficients]
-        turned = (to_world @ sh.flatten(2)).unflatten(2, (3, -1))
-        return turned.flatten(1, 2).transpose(1, 2).unflatten(2, (self.coefficients, 3))
+        to_world = sh_rotation(camera, self.coefficients)  # [views, coefficients, coefficients]
+        rotated = (to_world @ sh.flatten(2)).unflatten(2, (3, -1))
+        return rotated.flatten(1, 2).transpose(1, 2).unflatten(2, (self.coefficients, 3))
 
 
 def _normalise_quaternion(xyzw: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Cameras and projections in closed form: rigid inverses, neighbours, and where a pixel lands in another view.
+"""Cameras in closed form: inverses, normalised and pixel intrinsics, neighbouring views, projection between views.
 
 Extrinsics are camera-to-world with OpenCV axes (x right, y down, z forward); intrinsics [views, 3, 3] have no skew.
 """
@@ -12,12 +12,12 @@ from .layers import repeat_views
 
 # A projection nearer to the camera plane than this, in scene units, counts as behind the camera (matching.py).
 MIN_DEPTH = 1e-3
-# With this many views or fewer, the neighbours keep the order of the views; with more, they come nearest first.
+# With at most this many views, neighbours keep the order of the views; with more, the nearest come first.
 ORDERED_VIEWS = 3
 
 
 class Cameras(NamedTuple):
-    """What the geometry needs of the views."""
+    """Poses, intrinsics and depth ranges of the views."""
 
     extrinsics: Tensor  # [views, 4, 4] camera-to-world, OpenCV axes
     intrinsics: Tensor  # [views, 3, 3] normalised by width and height
@@ -25,19 +25,19 @@ class Cameras(NamedTuple):
     far: Tensor  # [views]
 
     def inverse_range(self) -> tuple[Tensor, Tensor]:
-        """The inverse depths of the far and of the near end, each [views, 1, 1, 1] to meet maps."""
+        """The inverse depths 1 / far and 1 / near, each [views, 1, 1, 1]."""
         return (1 / self.far)[:, None, None, None], (1 / self.near)[:, None, None, None]
 
 
 def invert_rigid(transform: Tensor) -> Tensor:
-    """Inverse of rigid transforms [..., 4, 4], without a linear solver."""
+    """Inverse [R^T, -R^T t] of rigid transforms [R, t], [..., 4, 4]: ONNX has no linear solver."""
     rotation = transform[..., :3, :3].transpose(-1, -2)
     translation = -rotation @ transform[..., :3, 3:]
     return torch.cat([torch.cat([rotation, translation], dim=-1), transform[..., 3:, :]], dim=-2)
 
 
 def invert_intrinsics(intrinsics: Tensor) -> Tensor:
-    """Inverse of skewless intrinsics [views, 3, 3]."""
+    """Inverse of intrinsics without skew, [views, 3, 3]."""
     fx, fy = intrinsics[..., 0, 0], intrinsics[..., 1, 1]
     cx, cy = intrinsics[..., 0, 2], intrinsics[..., 1, 2]
     zero, one = torch.zeros_like(fx), torch.ones_like(fx)
@@ -45,8 +45,8 @@ def invert_intrinsics(intrinsics: Tensor) -> Tensor:
     return torch.stack(rows, dim=-1).reshape(-1, 3, 3)
 
 
-def scale_intrinsics(intrinsics: Tensor, height: int, width: int) -> Tensor:
-    """Intrinsics normalised by image size -> in pixels of a map of the given size."""
+def denormalize_intrinsics(intrinsics: Tensor, height: int, width: int) -> Tensor:
+    """Normalised intrinsics [views, 3, 3] -> in pixels of a map of this size."""
     return torch.cat([intrinsics[:, :1] * width, intrinsics[:, 1:2] * height, intrinsics[:, 2:]], dim=1)
 
 
@@ -58,10 +58,10 @@ def pixel_grid(height: int, width: int, like: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def nearest_views(extrinsics: Tensor, count: int) -> Tensor:
-    """The views that each view is matched with: up to `count` others by distance of the camera centres.
+    """The views that each view is matched with: the `count` others with the nearest camera centres.
 
-    With `ORDERED_VIEWS` or fewer these are all others in their given order, as in the releases, where the order
-    decides which pairs share the U-Net's cross-view attention.
+    With `ORDERED_VIEWS` or fewer these are all others in the given order, as in the releases: the order decides which
+    pairs share the U-Net's cross-view attention.
 
     extrinsics: [views, 4, 4]. Returns indices [views, neighbours], neighbours = min(views - 1, count).
     """
@@ -74,19 +74,23 @@ def nearest_views(extrinsics: Tensor, count: int) -> Tensor:
     many = torch.ones_like(centres[:, 0]).sum() > ORDERED_VIEWS
     itself = index[:, None] == index[None]
     key = torch.where(itself, torch.inf, torch.where(many, distance, order))
-    # Slices stop at the end by themselves: the view itself is last, and fewer than `count` others are no special case.
+    # The view itself sorts last. A slice beyond the end is cut, so fewer than `count` others need no special case.
     return key.argsort(dim=1)[:, :-1][:, :count]
 
 
 def project_points(
     inverse_depth: Tensor, intrinsics: Tensor, extrinsics: Tensor, neighbours: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Where each pixel of each view lands in its neighbours, for each of its inverse depths.
+    """Projection of each pixel of each view into its neighbours, at each of its inverse depths.
+
+    Pixel p = [u, v, 1] of view i at inverse depth w is the point X = K_i^-1 p / w. With the relative pose [R, t] from i
+    to neighbour j, its projection is K_j (R X + t) ~ K_j (R K_i^-1 p + t w): the division by w cancels, so w = 0 (a
+    point at infinity) needs no special case. The inverse depth in j is w / z, z being the last component.
 
     inverse_depth: in 1 / scene units, [views, candidates, h, w].
     intrinsics: in pixels of the same map, [views, 3, 3]; pixel centres at integers, as the releases warp.
     extrinsics: [views, 4, 4]. neighbours: [views, n].
-    Returns x and y in pixels, the inverse depth there and whether the point lies before the camera, each
+    Returns x and y in pixels, the inverse depth in the neighbour, and whether the point is in front of the camera, each
     [views * n, candidates, h * w].
     """
     _, _, height, width = inverse_depth.shape
@@ -98,7 +102,6 @@ def project_points(
     rays = relative[:, :3, :3] @ repeat_views(rays, count)  # [pairs, 3, h * w]
     inverse = repeat_views(inverse_depth.flatten(2), count)  # [pairs, candidates, h * w]
 
-    # A point at inverse depth w is (ray + shift * w) / w. The division by w cancels in the projection.
     x, y, z = (rays[:, axis : axis + 1] + relative[:, axis : axis + 1, 3:] * inverse for axis in range(3))
     x = x / z * target[:, 0, 0:1] + target[:, 0, 2:3]
     y = y / z * target[:, 1, 1:2] + target[:, 1, 2:3]
@@ -108,16 +111,17 @@ def project_points(
 def project_candidates(
     inverse_depth: Tensor, intrinsics: Tensor, extrinsics: Tensor, neighbours: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """`project_points` without the inverse depth there."""
+    """`project_points` without the inverse depth in the neighbour."""
     x, y, _, front = project_points(inverse_depth, intrinsics, extrinsics, neighbours)
     return x, y, front
 
 
-def nearest_pixels(inverse_depth: Tensor, intrinsics: Tensor, extrinsics: Tensor, neighbours: Tensor) -> Tensor:
-    """The warp indices of IDESplat: the row, in a table of all views' pixels, that each candidate falls on.
+def warp_indices(inverse_depth: Tensor, intrinsics: Tensor, extrinsics: Tensor, neighbours: Tensor) -> Tensor:
+    """Warp indices (IDESplat, section 2): I^{j->i}(x, m), the pixel of view j that pixel x sees at candidate m.
 
-    Arguments as for `project_candidates`. Returns int32 [views * n, candidates, h * w] with values in
-    [0, views * h * w]; the last row stands for "outside", whose feature is zero.
+    The index is that of the nearest pixel in the concatenated pixels of all views, j * h * w + round(y) * w + round(x).
+    Arguments as for `project_points`. Returns int32 [views * n, candidates, h * w] with values in [0, views * h * w];
+    the last value stands for projections outside the image or behind the camera, whose feature is zero.
     """
     views, _, height, width = inverse_depth.shape
     with torch.no_grad():
@@ -131,10 +135,10 @@ def nearest_pixels(inverse_depth: Tensor, intrinsics: Tensor, extrinsics: Tensor
 def sampling_points(
     inverse_depth: Tensor, intrinsics: Tensor, extrinsics: Tensor, neighbours: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Where DepthSplat's warp looks: x and y in pixels, each [views * n, candidates, h * w].
+    """Sampling positions of a bilinear warp with zero padding: x and y in pixels, each [views * n, candidates, h * w].
 
-    Arguments as for `project_candidates`. What lies outside or behind the camera is brought to one pixel from the
-    map's border, where zero padding leaves nothing of it.
+    Arguments as for `project_points`. Positions outside the map or behind the camera are clamped to one pixel beyond
+    the border, where zero padding makes the sample zero.
     """
     _, _, height, width = inverse_depth.shape
     with torch.no_grad():

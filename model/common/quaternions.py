@@ -1,4 +1,4 @@
-"""Quaternions wxyz."""
+"""Unit quaternions in the order wxyz, without branches on the data, so that they can be exported."""
 
 import torch
 from torch import Tensor
@@ -17,10 +17,11 @@ def quaternion_product(a: Tensor, b: Tensor) -> Tensor:
     return torch.stack(product, dim=-1)
 
 
-def quaternion_from_matrix(rotation: Tensor) -> Tensor:
-    """Rotations [views, 3, 3] -> unit quaternions wxyz [views, 4], without a branch on the data.
+def matrices_to_quaternions(rotation: Tensor) -> Tensor:
+    """Rotations [views, 3, 3] -> unit quaternions wxyz [views, 4].
 
-    Of the four usual solutions the one with the largest divisor is taken, which is never small.
+    Row i of `candidates` is 4 q_i q, whose diagonal is 4 q_i^2. The row with the largest q_i is normalised; its length
+    is never small (Shepperd's method).
     """
     m00, m01, m02, m10, m11, m12, m20, m21, m22 = rotation.flatten(-2).unbind(-1)
     candidates = [
@@ -33,3 +34,14 @@ def quaternion_from_matrix(rotation: Tensor) -> Tensor:
     best = torch.stack([candidates[i][i] for i in range(4)], dim=-1).argmax(-1)  # [views]
     chosen = stacked.gather(-2, best[:, None, None].expand(-1, 1, 4))[:, 0]
     return chosen / chosen.norm(dim=-1, keepdim=True)
+
+
+def quaternions_to_matrices(quats: Tensor) -> Tensor:
+    """Quaternions wxyz of any length but zero [..., 4] -> rotations [..., 3, 3]."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    rows = [
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    ]
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))

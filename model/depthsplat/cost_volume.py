@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..common.bilinear import bordered, corners_around, interpolate
 from ..common.gather_attention import GatherAttention
-from ..common.geometry import Cameras, sampling_points, scale_intrinsics
+from ..common.geometry import Cameras, denormalize_intrinsics, sampling_points
 from ..common.layers import repeat_views, static_dim, to_tokens
 
 CORNERS = 4  # pixels around a point
@@ -28,7 +28,7 @@ def cost_volume(
     """
     views, _, height, width = features.shape
     channels, count = static_dim(features.shape[1]), static_dim(candidates.shape[1])
-    intrinsics = scale_intrinsics(cameras.intrinsics, height, width)
+    intrinsics = denormalize_intrinsics(cameras.intrinsics, height, width)
     x, y = sampling_points(candidates, intrinsics, cameras.extrinsics, neighbours)
     if torch.onnx.is_in_onnx_export():
         scores = by_gathering(features, neighbours, x, y, gather_attention)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 from ..common.dinov2 import DinoV2
-from ..common.encoder import ViewEncoder, normalise
+from ..common.encoder import ViewEncoder, normalize_images
 from ..common.geometry import nearest_views
 from ..common.layers import resize
 from .config import DepthSplatConfig
@@ -42,7 +42,7 @@ class PyramidEncoder(ViewEncoder):
     def forward(self, images: Tensor, extrinsics: Tensor) -> PyramidFeatures:
         """Images [views, 3, H, W] in [0, 1], extrinsics [views, 4, 4] -> the encoder's maps."""
         neighbours = nearest_views(extrinsics, self.neighbours)
-        images = normalise(images)
+        images = normalize_images(images)
         cnn, cnn_fine, cnn_finest = self.backbone(images)
         mv = self.transformer(cnn, neighbours)
         maps = self.mono_maps(images)

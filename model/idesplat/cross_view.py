@@ -5,7 +5,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..common.bilinear import bordered, corners_around, interpolate
-from ..common.geometry import Cameras, project_points, scale_intrinsics
+from ..common.geometry import Cameras, denormalize_intrinsics, project_points
 from ..common.layers import repeat_views, to_tokens
 
 # Inverse depths that differ by this share of theirs agree half-way.
@@ -48,7 +48,7 @@ def _places(inverse_depth: Tensor, cameras: Cameras, neighbours: Tensor) -> tupl
     What falls outside or behind the camera is brought to where the border of zeros is.
     """
     height, width = inverse_depth.shape[2:]
-    pixels = scale_intrinsics(cameras.intrinsics, height, width)
+    pixels = denormalize_intrinsics(cameras.intrinsics, height, width)
     x, y, there, front = project_points(inverse_depth, pixels, cameras.extrinsics, neighbours)
     return torch.where(front, x, -1.0).clamp(-1, width), torch.where(front, y, -1.0).clamp(-1, height), there
 

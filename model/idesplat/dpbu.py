@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..common.geometry import Cameras, nearest_pixels, scale_intrinsics
+from ..common.geometry import Cameras, denormalize_intrinsics, warp_indices
 from ..common.layers import ConcatConv1x1, Upsample2x, resize, static_dim
 from .config import DPBUConfig, IDESplatConfig
 from .encoder import EncoderFeatures
@@ -46,8 +46,8 @@ class DPBU(nn.Module):
     ) -> DPBUOutput:
         """Run two layers over the same warp indices, starting from `features` and `coarse_inverse_depth`."""
         height, width = features.shape[2:]
-        pixels = scale_intrinsics(cameras.intrinsics, height, width)
-        rows = nearest_pixels(candidates, pixels, cameras.extrinsics, neighbours)
+        pixels = denormalize_intrinsics(cameras.intrinsics, height, width)
+        rows = warp_indices(candidates, pixels, cameras.extrinsics, neighbours)
         features, prior = self.first(features, coarse_inverse_depth, rows, None)
         first_depth, _ = expectation(prior, candidates)
         features, posterior = self.second(features, first_depth, rows, prior)

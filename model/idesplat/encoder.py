@@ -6,7 +6,7 @@ from torch import Tensor
 
 from ..common.dinov2 import DinoV2
 from ..common.dpt import DPTHead
-from ..common.encoder import ViewEncoder, normalise
+from ..common.encoder import ViewEncoder, normalize_images
 from ..common.geometry import nearest_views
 from ..common.layers import resize
 from .config import IDESplatConfig
@@ -38,7 +38,7 @@ class Encoder(ViewEncoder):
     def forward(self, images: Tensor, extrinsics: Tensor) -> EncoderFeatures:
         """Images [views, 3, H, W] in [0, 1], extrinsics [views, 4, 4] -> the encoder's maps."""
         neighbours = nearest_views(extrinsics, self.neighbours)
-        normalised = normalise(images)
+        normalised = normalize_images(images)
         cnn, cnn_fine, _ = self.backbone(normalised)
         mv = self.transformer(cnn, neighbours)
         size = cnn.shape[2:]

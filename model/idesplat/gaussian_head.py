@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ..common.encoder import normalise
+from ..common.encoder import normalize_images
 from ..common.gaussian_adapter import BASE_PARAMETERS, GaussianAdapter
 from ..common.geometry import Cameras
 from ..common.layers import resize
@@ -95,7 +95,7 @@ class GaussianStage(nn.Module):
 
     def predict(self, images: Tensor, cameras: Cameras, inputs: HeadInputs) -> ModelOutput:
         """Focused module, Gaussian head and adapter."""
-        features = self.pixel_features(normalise(images), inputs)
+        features = self.pixel_features(normalize_images(images), inputs)
         raw = self.head2(F.gelu(self.head1(features)))
         if self.cross_view is not None:
             raw = raw + self.cross_view(images, cameras, inputs)

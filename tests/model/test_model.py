@@ -7,7 +7,7 @@ from idesplat.export.example_inputs import example_inputs
 from idesplat.model.common import geometry
 from idesplat.model.common.gaussian_adapter import GaussianAdapter
 from idesplat.model.common.geometry import Cameras
-from idesplat.model.common.quaternions import quaternion_from_matrix
+from idesplat.model.common.quaternions import matrices_to_quaternions
 from idesplat.model.idesplat.config import IDESplatConfig
 from idesplat.model.idesplat.network import IDESplat
 from idesplat.model.registry import PRESETS
@@ -83,7 +83,7 @@ def test_quaternions_give_their_matrices_back():
         [torch.diag(torch.tensor(d)) for d in ([1.0, 1, 1], [1.0, -1, -1], [-1.0, 1, -1], [-1.0, -1, 1])]
     )
     rotations = torch.cat([rotations, flips])
-    w, x, y, z = quaternion_from_matrix(rotations).unbind(-1)
+    w, x, y, z = matrices_to_quaternions(rotations).unbind(-1)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
@@ -98,7 +98,7 @@ def test_nearest_pixels_see_a_plane_where_it_is():
     extrinsics = torch.eye(4).repeat(2, 1, 1)
     extrinsics[1, 0, 3] = 0.5
     candidates = torch.tensor([0.5, 1e-6]).view(1, 2, 1, 1).expand(2, -1, 16, 16)
-    rows = geometry.nearest_pixels(candidates, intrinsics, extrinsics, torch.tensor([[1], [0]])).view(2, 2, 16, 16)
+    rows = geometry.warp_indices(candidates, intrinsics, extrinsics, torch.tensor([[1], [0]])).view(2, 2, 16, 16)
     pixel, outside = torch.arange(256).view(16, 16), 2 * 256
     assert (rows[0, 0, :, 4:] == 256 + pixel[:, :-4]).all()  # view 0 looks into view 1, shifted by 4 pixels
     assert (rows[0, 0, :, :4] == outside).all()

@@ -14,8 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ...model.common.quaternions import quaternions_to_matrices
+from ...model.common.sh import SH_0, sh_basis
 from ...runtime.geometry.projection import EPS2D, FOV_MARGIN
-from ...runtime.geometry.sh import SH_0, SH_1, SH_2, SH_3
 from ...runtime.rendering.types import MAX_ALPHA, MIN_ALPHA
 
 NEAR = 0.01  # scene units
@@ -89,16 +90,7 @@ def _project(
 
 def _scaled_axes(quats: Tensor, scales: Tensor) -> Tensor:
     """R S: rotation matrices times scales, [gaussians, 3, 3]."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
-    rotation = torch.stack(
-        [
-            *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-            *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-            *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-        ],
-        dim=-1,
-    )
-    return rotation.view(-1, 3, 3) * scales[:, None, :]
+    return quaternions_to_matrices(quats) * scales[:, None, :]
 
 
 def _colors(sh: Tensor, means: Tensor, camera: Tensor) -> Tensor:
@@ -106,20 +98,8 @@ def _colors(sh: Tensor, means: Tensor, camera: Tensor) -> Tensor:
     count = sh.shape[1]
     if count == 1:
         return torch.clamp_min(SH_0 * sh[:, 0] + 0.5, 0)
-    x, y, z = torch.nn.functional.normalize(means - camera, dim=-1).unbind(-1)
-    basis = [torch.full_like(x, SH_0)]
-    basis += [-SH_1 * y, SH_1 * z, -SH_1 * x]
-    if count > 4:
-        basis += [SH_2[0] * x * y, -SH_2[0] * y * z]
-        basis += [SH_2[1] * (2 * z * z - x * x - y * y)]
-        basis += [-SH_2[0] * x * z, SH_2[2] * (x * x - y * y)]
-    if count > 9:
-        basis += [-SH_3[0] * y * (3 * x * x - y * y), SH_3[1] * x * y * z]
-        basis += [-SH_3[2] * y * (4 * z * z - x * x - y * y)]
-        basis += [SH_3[3] * z * (2 * z * z - 3 * x * x - 3 * y * y)]
-        basis += [-SH_3[2] * x * (4 * z * z - x * x - y * y)]
-        basis += [SH_3[4] * z * (x * x - y * y), -SH_3[0] * x * (x * x - 3 * y * y)]
-    return torch.clamp_min((torch.stack(basis, dim=-1)[:, :, None] * sh).sum(dim=1) + 0.5, 0)
+    basis = sh_basis(torch.nn.functional.normalize(means - camera, dim=-1), count)
+    return torch.clamp_min((basis[:, :, None] * sh).sum(dim=1) + 0.5, 0)
 
 
 class _Composite(torch.autograd.Function):

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
-from ...model.common.geometry import invert_rigid, scale_intrinsics
+from ...model.common.geometry import denormalize_intrinsics, invert_rigid
 from ...model.common.layers import resize
 from ...model.idesplat.dpbu import Cameras, DPBUOutput
 from ...model.idesplat.encoder import EncoderFeatures
@@ -63,7 +63,7 @@ def render_targets(gaussians: tuple[Tensor, ...], views: TrainingViews) -> Tenso
     """Gaussians (means, scales, quats, opacities, sh) seen by the target cameras, on black, [targets, 3, H, W]."""
     means, scales, quats, opacities, sh = gaussians
     height, width = views.target_images.shape[2:]
-    Ks = scale_intrinsics(views.target_intrinsics, height, width)
+    Ks = denormalize_intrinsics(views.target_intrinsics, height, width)
     background = torch.zeros(3)
     images = [
         rasterize(means, quats, scales, opacities, sh, viewmat, K, width, height, background)[0]

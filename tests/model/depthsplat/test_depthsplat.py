@@ -18,7 +18,7 @@ from idesplat.export.conversion import build_metadata
 from idesplat.export.stages import NamedTensors
 from idesplat.export.tracing import StaticShape, export_graphs
 from idesplat.model.common.gather_attention import GatherAttention
-from idesplat.model.common.geometry import Cameras, project_candidates, sampling_points, scale_intrinsics
+from idesplat.model.common.geometry import Cameras, denormalize_intrinsics, project_candidates, sampling_points
 from idesplat.model.common.layers import resize
 from idesplat.model.depthsplat.cost_volume import by_gathering, by_sampling
 from idesplat.model.registry import PRESETS, build
@@ -147,7 +147,7 @@ def test_every_form_of_the_cost_volume_is_grid_sample_then_correlation(form):
     features = torch.randn(count, channels, height, width, generator=torch.Generator().manual_seed(1))
     candidates = torch.linspace(0.01, 2, 11)[None, :, None, None].expand(count, -1, height, width)
     neighbours = torch.tensor([[1, 2], [0, 3], [3, 1], [0, 2]])
-    pixels = scale_intrinsics(intrinsics, height, width)
+    pixels = denormalize_intrinsics(intrinsics, height, width)
     found = form(features, neighbours, *sampling_points(candidates, pixels, extrinsics, neighbours))
 
     x, y, front = project_candidates(candidates, pixels, extrinsics, neighbours)

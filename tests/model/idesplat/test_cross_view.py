@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from idesplat.model.common.geometry import Cameras, nearest_views, scale_intrinsics
+from idesplat.model.common.geometry import Cameras, denormalize_intrinsics, nearest_views
 from idesplat.model.idesplat.cross_view import CHANNELS, TOLERANCE, cross_view_features
 
 SIZE, DEPTH, FOCAL = 16, 4.0, 1.0  # pixels, scene units, image widths
@@ -55,7 +55,7 @@ def test_pixels_are_compared_where_the_warp_indices_point() -> None:
     """The depth decides the place: at half the inverse depth a pixel is compared with one half as far away."""
     images, inverse_depth, cameras = plane()
     _, colour, _, _, _ = compared(images, inverse_depth / 2, cameras)
-    pixels = scale_intrinsics(cameras.intrinsics, SIZE, SIZE)
+    pixels = denormalize_intrinsics(cameras.intrinsics, SIZE, SIZE)
     assert pixels[0, 0, 0] == FOCAL * SIZE
     expected = images[1][:, :, 8 - SHIFT // 2] - images[0][:, :, 8]
     assert torch.allclose(colour[0][:, :, 8], expected, atol=1e-4)
