@@ -22,7 +22,7 @@ class ViTConfig:
 
 @dataclass(frozen=True)
 class DPTConfig:
-    """The dense prediction head atop the ViT."""
+    """The dense prediction (DPT) head on the ViT."""
 
     features: int = 64
     # Channels of the four reassembled maps, finest first.
@@ -38,7 +38,7 @@ class UNetConfig:
     channels: int
     levels: int
     heads: int = 4
-    # Pixels of a block that become channels, a side: a large map of few channels is slow to convolve.
+    # Side of the pixel blocks that become channels (pixel unshuffle): a large map of few channels is slow to convolve.
     shuffle: int = 1
 
     @property
@@ -49,7 +49,7 @@ class UNetConfig:
 
 @dataclass(frozen=True)
 class EncoderConfig(ABC):
-    """What both networks have: the encoder, the Gaussians' parameters, and the cameras and images of the training."""
+    """What all networks have: the encoder, the Gaussians' parameters, and the cameras and images of the training."""
 
     # Image size over the coarsest feature map's, 4 or 8.
     feature_stride: int = 4
@@ -67,13 +67,13 @@ class EncoderConfig(ABC):
     sh_degree: int = 2
     scale_min: float = 1e-10
     scale_max: float = 3.0
-    # Whether Gaussians' scales are predicted in pixels at their depth, and not in scene units as in the releases: the
-    # network is not told the focal length, so that in scene units it serves one field of view and one image size.
+    # Whether Gaussians' scales are predicted in pixels at their depth, and not in scene units as in the releases. The
+    # focal length is no input, so scales in scene units fit one field of view and one image size.
     scale_in_pixels: bool = False
     # The depth range it was trained with, in scene units.
     near: float = 0.5
     far: float = 100.0
-    # The image size it was trained at; a network that was trained at others, too, does best at this one.
+    # The image size it was trained at; if it was trained at several, the one with the best quality.
     height: int = 256
     width: int = 256
     # The fewest and the most views it was trained with, and the shortest and longest side of its images.

@@ -1,4 +1,4 @@
-"""The DINOv2 vision transformer, as Depth Anything V2 uses it."""
+"""The DINOv2 vision transformer (Oquab et al. 2023), as Depth Anything V2 uses it."""
 
 import torch
 import torch.nn.functional as F
@@ -8,7 +8,7 @@ from ..config import ViTConfig
 from .layers import attention, to_map, to_tokens
 
 NORM_EPSILON = 1e-6
-# DINOv2 adds this to the size asked of the position embedding's interpolation, and its weights expect it.
+# DINOv2 adds this to the target size when it interpolates the position embedding; its weights were trained so.
 INTERPOLATION_OFFSET = 0.1
 # The cubic convolution coefficient of torch's bicubic interpolation.
 CUBIC = -0.75
@@ -50,7 +50,7 @@ class Block(nn.Module):
 
 
 class DinoV2(nn.Module):
-    """Images to the normalised patch tokens of four blocks."""
+    """Images -> the normalised patch tokens of four blocks."""
 
     def __init__(self, config: ViTConfig) -> None:
         super().__init__()
@@ -76,7 +76,7 @@ class DinoV2(nn.Module):
         return maps
 
     def _position_embedding(self, rows: int, columns: int) -> Tensor:
-        """The trained square of position embeddings, interpolated bicubically: [1, 1 + rows * columns, dim]."""
+        """The trained grid of position embeddings, resized bicubically: [1, 1 + rows * columns, dim]."""
         grid = self.config.grid
         square = self.pos_embed[0, 1:].reshape(grid, -1)  # [grid, grid * dim]: two dimensions, which OpenVINO needs
         # At the trained size the embedding is taken as it is: without the offset the weights are the identity.
@@ -92,19 +92,18 @@ class DinoV2(nn.Module):
 def _cubic_weights(out_size: int, in_size: int, offset: Tensor, like: Tensor) -> Tensor:
     """Bicubic interpolation along one axis as a matrix [out_size, in_size], equal to torch's with clamped borders.
 
-    A matrix, since ONNX's Resize takes either a size or a scale, and the releases' arithmetic needs a scale that
-    differs from the ratio of the sizes.
+    ONNX's Resize takes either a size or a scale, and the releases use a scale that differs from the ratio of the sizes.
     """
     steps = torch.arange(out_size, device=like.device).to(like.dtype)
     position = (steps + 0.5) * (in_size / (like.new_ones(out_size).sum() + offset)) - 0.5
     base = position.floor()
     columns = torch.arange(in_size, device=like.device).to(like.dtype)
     weights = torch.zeros_like(position)[:, None] * columns
-    for tap in (-1, 0, 1, 2):
-        distance = (position - base - tap).abs()
+    for shift in (-1, 0, 1, 2):
+        distance = (position - base - shift).abs()
         near = ((CUBIC + 2) * distance - (CUBIC + 3)) * distance**2 + 1
         far = ((CUBIC * distance - 5 * CUBIC) * distance + 8 * CUBIC) * distance - 4 * CUBIC
         weight = torch.where(distance <= 1, near, far)
-        source = (base + tap).clamp(0, in_size - 1)
+        source = (base + shift).clamp(0, in_size - 1)
         weights = weights + weight[:, None] * (source[:, None] == columns).to(like.dtype)
     return weights

@@ -1,4 +1,4 @@
-"""Dense prediction from a ViT's maps (DPT), and the head of Depth Anything V2: a feature map and disparity."""
+"""The dense prediction transformer's decoder (DPT, Ranftl et al. 2021), and Depth Anything V2's head on it."""
 
 import torch
 import torch.nn.functional as F
@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from ..config import DPTConfig
 from .layers import resize
 
-# Stands for the largest disparity where all are zero, so that an untrained head yields zeros and not NaN.
+# Lower limit of the largest disparity: an untrained head returns zeros instead of NaN.
 TINY = 1e-12
 
 
@@ -25,7 +25,7 @@ class ResidualConvUnit(nn.Module):
 
 
 class Fusion(nn.Module):
-    """Adds a finer map to the path from the coarser ones, and brings the sum to the next finer size."""
+    """Adds a finer map to the decoder path, and resizes the sum to the next finer size."""
 
     def __init__(self, channels: int, lateral: bool) -> None:
         super().__init__()
@@ -37,15 +37,15 @@ class Fusion(nn.Module):
         """Maps [n, channels, h, w] -> [n, channels, height, width]."""
         if self.lateral is not None and lateral is not None:
             path = path + self.lateral(lateral)
-        # The releases resize before the 1x1 convolution; the two commute, and this order is four times less work.
+        # The releases resize before the 1x1 convolution; the two commute, and this order is a quarter of the work.
         return resize(self.out_conv(self.unit(path)), height, width)
 
 
 class DPT(nn.Module):
-    """Four ViT maps to features at eight times their resolution."""
+    """Four ViT maps -> features at eight times their resolution."""
 
     def __init__(self, dim: int, channels: tuple[int, int, int, int], features: int) -> None:
-        """`dim` is the ViT's; `channels` are those of the four reassembled maps, finest first."""
+        """dim: of the ViT's tokens. channels: of the four reassembled maps, finest first."""
         super().__init__()
         self.projects = nn.ModuleList(nn.Conv2d(dim, count, 1) for count in channels)
         self.upsample4 = nn.ConvTranspose2d(channels[0], channels[0], 4, stride=4)
@@ -55,7 +55,7 @@ class DPT(nn.Module):
         self.fusions = nn.ModuleList(Fusion(features, lateral=level < 3) for level in range(4))
 
     def reassemble(self, first: Tensor, second: Tensor, third: Tensor, fourth: Tensor) -> list[Tensor]:
-        """Projected maps of one size, [n, channels, rows, columns], to a pyramid of 4, 2, 1 and 1/2 times the size."""
+        """Projected maps [n, channels, rows, columns] -> a pyramid of 4, 2, 1 and 1/2 times their size."""
         return [self.upsample4(first), self.upsample2(second), third, self.downsample(fourth)]
 
     def fuse(self, pyramid: list[Tensor]) -> Tensor:
@@ -69,7 +69,7 @@ class DPT(nn.Module):
 
 
 class DPTHead(DPT):
-    """Depth Anything V2's head: the features, and a relative disparity at image size."""
+    """Depth Anything V2's head: features, and relative disparity at image size."""
 
     def __init__(self, dim: int, patch: int, config: DPTConfig) -> None:
         super().__init__(dim, config.channels, config.features)

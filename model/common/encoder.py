@@ -1,4 +1,4 @@
-"""What is known of the views before any depth: features of a CNN, of matching across views, and of a ViT."""
+"""What the encoders share: a CNN pyramid, the multi-view transformer, and the ViT's maps."""
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +14,7 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 class ViewEncoder(nn.Module):
-    """What both networks' encoders share: CNN pyramid, multi-view transformer and ViT."""
+    """CNN pyramid, multi-view transformer and, where a family adds it, the ViT."""
 
     def __init__(self, config: EncoderConfig) -> None:
         super().__init__()
@@ -26,7 +26,7 @@ class ViewEncoder(nn.Module):
         self.vit: DinoV2 | None = None
 
     def mono_maps(self, images: Tensor) -> list[Tensor]:
-        """Normalised images -> the four tapped maps of the ViT, [views, ViT channels, patch rows, patch columns]."""
+        """Normalised images -> the ViT's maps at `out_indices`, [views, ViT channels, patch rows, patch columns]."""
         assert self.vit is not None
         patch = self.vit.config.patch
         rows, columns = images.shape[2] // patch, images.shape[3] // patch
@@ -34,7 +34,7 @@ class ViewEncoder(nn.Module):
 
 
 def normalize_images(images: Tensor) -> Tensor:
-    """RGB in [0, 1] -> ImageNet's mean and deviation, [views, 3, H, W]."""
+    """RGB in [0, 1] -> normalised by ImageNet's mean and standard deviation, [views, 3, H, W]."""
     mean = torch.tensor(IMAGENET_MEAN, dtype=images.dtype, device=images.device)[:, None, None]
     std = torch.tensor(IMAGENET_STD, dtype=images.dtype, device=images.device)[:, None, None]
     return (images - mean) / std

@@ -1,6 +1,11 @@
-"""Products of pixels with the few rows of a table that each of them picks.
+"""Gather attention: scores and weighted sums of each pixel with a few rows of a table.
 
-A table holds the features of all pixels of all views, one a row; a pixel picks those rows that its candidates fall on.
+The table holds the features of all pixels of all views, one a row. rows[p, c, x] is the row of pixel x's candidate c:
+
+    gathered_dot:           score[p, c, x] = <query[p, x], table[rows[p, c, x]]>
+    gathered_weighted_sum:  sum[p, x] = sum_c probability[p, c, x] table[rows[p, c, x]]
+
+These are the sparse matrix products of the released CUDA extension, as standard operators.
 """
 
 import torch
@@ -9,22 +14,22 @@ from torch import Tensor, nn
 
 from .layers import static_dim
 
-# Candidates gathered at once: it bounds the memory to this many copies of the features.
+# Candidates gathered at a time, which bounds memory to this many copies of the features.
 CHUNK = 8
 
 
 class GatherAttention(nn.Module):
-    """The two products as a part of a network, where training on a CPU and the export put others in their place."""
+    """The two operations as attributes, which training on a CPU and the export replace by their own."""
 
     def __init__(self, gathers: int, block: int) -> None:
-        """gathers: the numbers that a pixel gathers for a product. block: pixels that every map has a multiple of."""
+        """gathers: values gathered a pixel. block: a number of pixels of which every map has a multiple."""
         super().__init__()
         self.gathers, self.block = gathers, block
         self.gathered_dot, self.gathered_weighted_sum = gathered_dot, gathered_weighted_sum
 
 
 def pixel_table(tokens: Tensor) -> Tensor:
-    """All views' pixels as rows, and a last row of zeros for what lies outside: [views * h * w + 1, channels]."""
+    """All views' pixels as rows, and a last row of zeros for "outside": [views * h * w + 1, channels]."""
     rows = tokens.flatten(0, 1)
     return torch.cat([rows, torch.zeros_like(rows[:1])])
 

@@ -1,4 +1,4 @@
-"""Small layers that several parts share."""
+"""Small layers and tensor helpers that several modules share."""
 
 import torch
 import torch.nn.functional as F
@@ -13,13 +13,13 @@ def resize(x: Tensor, height: int, width: int) -> Tensor:
 
 
 def softmax(x: Tensor, dim: int) -> Tensor:
-    """Softmax spelt out, since ONNX Runtime's CPU kernel is ten times slower along any axis but the last."""
+    """Softmax in elementary operators: ONNX Runtime's CPU kernel is ten times slower along any axis but the last."""
     exponentials = (x - x.amax(dim, keepdim=True)).exp()
     return exponentials / exponentials.sum(dim, keepdim=True)
 
 
 def static_dim(size: int) -> int:
-    """A size that the architecture fixes, as a plain integer, so that an export holds it as a constant."""
+    """A size that the architecture fixes, as a plain integer, which an exported graph holds as a constant."""
     return int(size)
 
 
@@ -29,7 +29,7 @@ def attention(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None) -> Te
 
 
 def repeat_views(x: Tensor, neighbours: int) -> Tensor:
-    """Each view's entry once for each of its neighbours: [views, ...] -> [views * neighbours, ...]."""
+    """Each view's entry repeated for each of its neighbours: [views, ...] -> [views * neighbours, ...]."""
     return x[:, None].expand(-1, neighbours, *[-1] * (x.dim() - 1)).flatten(0, 1)
 
 
@@ -54,10 +54,10 @@ class Upsample2x(nn.Sequential):
 
 
 class ConcatConv1x1(nn.Module):
-    """A 1x1 convolution over the concatenation of maps of any resolution, each resized to the asked size.
+    """A 1x1 convolution of the concatenation of maps that are resized to one size.
 
-    A 1x1 convolution and a bilinear resize commute, so each part is convolved at its own, often much lower,
-    resolution and channel count before it grows.
+    A 1x1 convolution and a bilinear resize commute, so each map is convolved at its own, often lower, resolution and
+    resized afterwards.
     """
 
     def __init__(self, in_channels: tuple[int, ...], out_channels: int) -> None:
@@ -66,7 +66,7 @@ class ConcatConv1x1(nn.Module):
         self.conv = nn.Conv2d(sum(in_channels), out_channels, 1)
 
     def forward(self, at_size: list[Tensor], to_resize: list[Tensor], height: int, width: int) -> Tensor:
-        """Merge maps that already have the size and maps that do not; in this order they fill `in_channels`."""
+        """Maps of the target size, then maps to resize, in the order of `in_channels` -> [n, out_channels, h, w]."""
         weights = self.conv.weight.split(self.in_channels, dim=1)
         whole = torch.cat(at_size, dim=1)
         merged = F.conv2d(whole, torch.cat(weights[: len(at_size)], dim=1), self.conv.bias)
@@ -76,7 +76,7 @@ class ConcatConv1x1(nn.Module):
 
 
 class DepthwiseConv(nn.Module):
-    """A depthwise convolution and GELU on tokens laid out as an image."""
+    """A depthwise convolution and GELU on tokens in the layout of an image."""
 
     def __init__(self, channels: int, kernel: int) -> None:
         super().__init__()
@@ -88,7 +88,7 @@ class DepthwiseConv(nn.Module):
 
 
 class ConvFFN(nn.Module):
-    """The feed-forward layer after epipolar and window attention: it also looks at a pixel's neighbours."""
+    """The feed-forward layer after epipolar and window attention, with a depthwise convolution in the hidden layer."""
 
     def __init__(self, channels: int, ratio: int, kernel: int) -> None:
         super().__init__()

@@ -1,4 +1,8 @@
-"""The multi-view transformer: windows attend within a view, then to its neighbours (GMFlow, UniMatch)."""
+"""The multi-view transformer (UniMatch, Xu et al. 2023, after GMFlow): self- and cross-attention within windows.
+
+Each block has self-attention in a view, cross-attention to the same windows of its neighbours, and a feed-forward
+layer over both, x + norm(MLP([x, message])). Odd blocks have windows that are shifted by half.
+"""
 
 import math
 
@@ -14,7 +18,7 @@ POSITION_EPSILON = 1e-6
 
 
 class MultiViewTransformer(nn.Module):
-    """Matching features that know of the other views."""
+    """CNN features to matching features, which depend on the neighbouring views."""
 
     def __init__(self, channels: int, layers: int, ffn_ratio: int, splits: int) -> None:
         super().__init__()
@@ -24,7 +28,7 @@ class MultiViewTransformer(nn.Module):
     def forward(self, features: Tensor, neighbours: Tensor) -> Tensor:
         """Features [views, channels, h, w], neighbours [views, n] -> features of the same shape.
 
-        h and w must be multiples of twice the number of splits a side; odd layers attend in windows shifted by half.
+        h and w must be multiples of twice the number of windows a side.
         """
         _, channels, height, width = features.shape
         rows, columns = height // self.splits, width // self.splits
@@ -77,8 +81,8 @@ class WindowAttention(nn.Module):
         q, k, v = self.q_proj(source), self.k_proj(target), self.v_proj(target)
         if neighbours is not None:
             # The windows of all neighbours as one sequence [views, windows, tokens * n, channels], neighbours fastest.
-            # The releases' mask of regions is repeated over it as if they were slowest, so that with two neighbours or
-            # more a region is seen with other tokens than its own. The weights were trained with it.
+            # The releases repeat the mask of regions over it as if neighbours were slowest, so that with two neighbours
+            # or more a region is masked with other tokens' regions. The weights were trained with that.
             k, v = (x[neighbours].permute(0, 2, 3, 1, 4).flatten(2, 3) for x in (k, v))
         if regions is None:
             message = attention(q, k, v)

@@ -1,4 +1,4 @@
-"""The U-Net that regularises cost volumes, with attention across views at its coarsest level (ldm_unet)."""
+"""The U-Net that regularises cost volumes, with cross-view attention at its coarsest level (the releases' ldm_unet)."""
 
 import torch
 import torch.nn.functional as F
@@ -54,7 +54,7 @@ class CrossViewAttention(nn.Module):
 
 
 class UNet(nn.Module):
-    """As many channels at every level; the input must halve evenly `levels - 1` times."""
+    """A U-Net with as many channels at every level; height and width must be divisible by 2^(levels - 1)."""
 
     def __init__(self, config: UNetConfig) -> None:
         super().__init__()
@@ -64,7 +64,7 @@ class UNet(nn.Module):
         self.downsamples = nn.ModuleList(nn.Conv2d(channels, channels, 3, stride=2, padding=1) for _ in range(last))
         self.down_attention = CrossViewAttention(channels, config.heads)
         self.middle = nn.ModuleList(ResBlock(channels, channels) for _ in range(2))
-        # Going up, each level has two blocks, since its downsampled input is also kept. Coarsest first.
+        # Two blocks a level, coarsest first: the output and the downsampled input of a level are both skip connections.
         self.up_blocks = nn.ModuleList(ResBlock(2 * channels, channels) for _ in range(2 * config.levels))
         self.up_attention = nn.ModuleList(CrossViewAttention(channels, config.heads) for _ in range(2))
         self.upsamples = nn.ModuleList(nn.Conv2d(channels, channels, 3, padding=1) for _ in range(last))
@@ -75,19 +75,19 @@ class UNet(nn.Module):
         """[groups * views, channels, h, w] -> the same shape."""
         last = len(self.downsamples)
         x = self.conv_in(x)
-        kept = [x]
+        skips = [x]
         for level, block in enumerate(self.down_blocks):
             x = block(x)
             if level == last:
                 x = self.down_attention(x, views)
-            kept.append(x)
+            skips.append(x)
             if level < last:
                 x = self.downsamples[level](x)
-                kept.append(x)
+                skips.append(x)
         for block in self.middle:
             x = block(x)
         for index, block in enumerate(self.up_blocks):
-            x = block(torch.cat([x, kept.pop()], dim=1))
+            x = block(torch.cat([x, skips.pop()], dim=1))
             if index < 2:
                 x = self.up_attention[index](x, views)
             if index % 2 and index // 2 < last:
@@ -96,7 +96,7 @@ class UNet(nn.Module):
 
 
 class CostRegulariser(nn.Module):
-    """Costs and what else is known of a pixel, through the U-Net, to a score for each candidate."""
+    """Costs and further features of a pixel -> a score for each candidate, by the U-Net."""
 
     def __init__(self, in_channels: int, candidates: int, config: UNetConfig) -> None:
         super().__init__()

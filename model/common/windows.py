@@ -1,4 +1,4 @@
-"""Cutting token images into attention windows, and shifted windows into regions, or the mask that says so (Swin)."""
+"""Windows of attention, and the regions of shifted windows or their mask, as in Swin transformers (Liu et al. 2021)."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -10,19 +10,19 @@ from .layers import static_dim
 
 # Added to the score between tokens that only a cyclic shift brought together.
 MASKED = -100.0
-# Into how many parts the windows of each group of regions fall, down and across.
+# Number of parts, down and across, of the windows in each group of regions.
 HALVES = ((1, 1), (1, 2), (2, 1), (2, 2))
 
 
 def split_windows(image: Tensor, rows: int, columns: int, shifted: bool = False) -> Tensor:
     """[n, h, w, channels] -> [n, windows, rows * columns, channels]; h and w are multiples of rows and columns.
 
-    Shifted windows lie half a window further down and right, and go on at the opposite border.
+    Shifted windows lie half a window further down and right, and wrap around at the opposite border.
     """
     count, height, width, _ = image.shape
     channels = static_dim(image.shape[3])
     if shifted:
-        image = _moved(image, rows // 2, columns // 2)
+        image = _roll(image, rows // 2, columns // 2)
     image = image.reshape(-1, height // rows, rows, width // columns, columns, channels)
     return image.permute(0, 1, 3, 2, 4, 5).reshape(count, -1, rows * columns, channels)
 
@@ -32,11 +32,11 @@ def join_windows(windows: Tensor, height: int, width: int, rows: int, columns: i
     channels = static_dim(windows.shape[-1])
     image = windows.reshape(-1, height // rows, width // columns, rows, columns, channels)
     image = image.permute(0, 1, 3, 2, 4, 5).reshape(-1, height, width, channels)
-    return _moved(image, height - rows // 2, width - columns // 2) if shifted else image
+    return _roll(image, height - rows // 2, width - columns // 2) if shifted else image
 
 
-def _moved(image: Tensor, up: int, left: int) -> Tensor:
-    """[n, h, w, channels] moved cyclically by so many pixels.
+def _roll(image: Tensor, up: int, left: int) -> Tensor:
+    """[n, h, w, channels] rolled up and left by these numbers of pixels.
 
     torch.roll by a size that is only known at run time cannot be exported.
     """
@@ -45,11 +45,11 @@ def _moved(image: Tensor, up: int, left: int) -> Tensor:
 
 
 class Regions(NamedTuple):
-    """What lies together in windows [rows, columns] that were shifted by half, of `splits` a side.
+    """The contiguous regions of windows [rows, columns] that are shifted by half, with `splits` windows a side.
 
-    The shift brings tokens from opposite borders into the last window of each axis, whose halves must not meet.
-    Attention within such regions computes what a mask over whole windows does, with 9/16 of the products for two
-    splits. The windows come in four groups: neither axis in halves, columns, rows, both.
+    The shift brings tokens from opposite borders into the last window of each axis, whose halves must not attend to
+    each other. Attention within regions computes what a mask over whole windows does, with 9/16 of the multiplications for
+    two splits. Windows form four groups: neither axis in halves, columns, rows, both.
     """
 
     splits: int
@@ -84,9 +84,10 @@ class Regions(NamedTuple):
 
 
 def region_mask(height: int, width: int, rows: int, columns: int, like: Tensor) -> Tensor:
-    """What to add to the scores of windows shifted by half their size, [windows, rows * columns, rows * columns].
+    """The mask added to the scores of windows shifted by half their size, [windows, rows * columns, rows * columns].
 
-    In the last window of each axis the shift brings together tokens from opposite borders, which must not meet.
+    In the last window of each axis the shift brings together tokens from opposite borders, which must not attend to
+    each other.
     """
     y = torch.arange(height, device=like.device)
     x = torch.arange(width, device=like.device)

@@ -1,4 +1,4 @@
-"""The sizes of DepthSplat."""
+"""DepthSplat's configuration."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ class DepthScaleConfig:
 
 @dataclass(frozen=True)
 class UpsamplerConfig:
-    """DepthSplat's two DPT heads, which bring depth and features to image size."""
+    """DepthSplat's two DPT heads, which upsample depth and features to image size."""
 
     # Channels of the four reassembled maps, finest first.
     channels: tuple[int, int, int, int] = (48, 96, 192, 384)
@@ -45,5 +45,5 @@ class DepthSplatConfig(EncoderConfig):
 
     @property
     def unets(self) -> Iterator[tuple[int, UNetConfig]]:
-        """Those of its scales."""
+        """The U-Nets of its scales."""
         return ((2**index, scale.unet) for index, scale in enumerate(self.scales))

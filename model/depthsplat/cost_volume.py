@@ -1,8 +1,13 @@
-"""How well each pixel matches its neighbours at each candidate depth, by bilinear warping (plane sweep).
+"""Plane-sweep cost volume: the correlation of each pixel with its neighbours' features at each candidate depth.
 
-Two forms of the same sums. PyTorch has an operator that samples features, which are then scored. In ONNX it is called
-GridSample, slow on CPUs and missing elsewhere. Interpolation and inner product commute, so a graph scores whole pixels
-first and interpolates between four scores.
+With pi_ij(x, w_m) the projection into neighbour j of view i's pixel x at candidate inverse depth w_m,
+
+    C(x, m) = mean over j of <F_i(x), F_j(pi_ij(x, w_m))> / sqrt(channels)
+
+where F_j is sampled bilinearly (DepthSplat's multi-view branch, after UniMatch). It is computed in one of two ways.
+PyTorch samples features with grid_sample, then takes inner products. In ONNX that operator, GridSample, is slow on CPUs
+and missing in some runtimes. Interpolation and inner product commute, so a graph scores the four whole pixels around pi
+and interpolates the scores.
 """
 
 import torch
@@ -23,8 +28,8 @@ def cost_volume(
     """Correlation of features [views, channels, h, w] with those of the neighbours, warped: [views, candidates, h, w].
 
     candidates: inverse depths [views, candidates, h, w]. neighbours: [views, n]; their costs are averaged.
-    Each view projects with its own intrinsics; the release projects into a neighbour with those of the view that looks,
-    which are the same in all that it was trained on.
+    A point is projected into a neighbour with the neighbour's intrinsics. The release takes those of the reference
+    view, which were the same throughout its training.
     """
     views, _, height, width = features.shape
     channels, count = static_dim(features.shape[1]), static_dim(candidates.shape[1])
@@ -39,7 +44,7 @@ def cost_volume(
 
 
 def by_sampling(features: Tensor, neighbours: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """Scores of every pixel with its neighbours' features at x and y, [pairs, candidates, h * w] like x and y."""
+    """Correlation with features sampled at x and y: [pairs, candidates, h * w], the shape of x and y."""
     height, width = features.shape[2:]
     grid = torch.stack([2 * x / (width - 1) - 1, 2 * y / (height - 1) - 1], dim=-1)
     warped = F.grid_sample(features[neighbours].flatten(0, 1), grid, align_corners=True)
@@ -50,7 +55,7 @@ def by_sampling(features: Tensor, neighbours: Tensor, x: Tensor, y: Tensor) -> T
 def by_gathering(
     features: Tensor, neighbours: Tensor, x: Tensor, y: Tensor, gather_attention: GatherAttention
 ) -> Tensor:
-    """The same by gathering the features of the four pixels around each candidate."""
+    """The same from the correlations with the four pixels around x and y."""
     own = repeat_views(to_tokens(features), neighbours.shape[1])  # [pairs, h * w, channels]
     table = to_tokens(bordered(features))  # [views, bordered pixels, channels]
     first = (neighbours.flatten() * table.shape[1]).to(torch.int32)[:, None, None]

@@ -1,4 +1,7 @@
-"""DepthSplat's depth, one scale after the other: a cost volume, its regularisation, and the expected inverse depth."""
+"""DepthSplat's depth at one scale: cost volume, U-Net regularisation, and the expected inverse depth.
+
+With probabilities P over candidate inverse depths w_m, the inverse depth is sum_m P(x, m) w_m.
+"""
 
 from typing import NamedTuple
 
@@ -17,7 +20,7 @@ from .upsampler import DepthUpsampler
 
 
 class DepthStageOutput(NamedTuple):
-    """What a scale yields."""
+    """What a scale returns."""
 
     features_mv: Tensor  # [views, channels, h, w], the matching features at its resolution
     inverse_depth: Tensor  # [views, 1, h, w]
@@ -27,7 +30,7 @@ class DepthStageOutput(NamedTuple):
 
 
 class DepthOutput(NamedTuple):
-    """The result of the network that has no Gaussians, and the scale that it comes from."""
+    """The output of the depth-only network, and the scale that it comes from."""
 
     depth: Tensor  # [views, H, W], metric z-depth
     scale: DepthStageOutput
@@ -58,7 +61,10 @@ class DepthStage(nn.Module):
     def match(
         self, cnn: Tensor, mv: Tensor, mono: Tensor, candidates: Tensor, cameras: Cameras, neighbours: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Three maps [views, channels, h, w] and candidate inverse depths -> inverse depth and probability."""
+        """Features and candidate inverse depths [views, candidates, h, w] -> inverse depth and probability.
+
+        cnn, mv, mono: maps [views, channels, h, w] of CNN, multi-view transformer and ViT. neighbours: [views, n].
+        """
         costs = cost_volume(mv, candidates, cameras, neighbours, self.gather_attention)
         known = torch.cat([costs, cnn, mv, mono], dim=1)
         regular = self.regulariser.scores(known, known.shape[0]) + self.shortcut(known)
@@ -79,13 +85,13 @@ class DepthStage(nn.Module):
 
 
 class CoarseDepth(DepthStage):
-    """The first scale: it searches the whole range."""
+    """The first scale: candidates over the whole range."""
 
     def __init__(self, config: DepthSplatConfig) -> None:
         super().__init__(config, scale=0)
 
     def forward(self, encoded: PyramidFeatures, cameras: Cameras) -> DepthStageOutput:
-        """Encoded views -> inverse depth at the encoder's resolution."""
+        """Encoder features -> inverse depth at the encoder's resolution."""
         mv = encoded.features_mv
         farthest, nearest = cameras.inverse_range()
         steps = torch.linspace(0, 1, self.candidates, dtype=mv.dtype, device=mv.device)[None, :, None, None]
@@ -102,15 +108,15 @@ class FineDepth(DepthStage):
 
     def __init__(self, config: DepthSplatConfig) -> None:
         super().__init__(config, scale=1)
-        # The first scale's intervals, and twice as many since this scale's are half as wide.
+        # Twice the first scale's number of intervals in the whole range: this scale's are half as wide.
         self.intervals = 2 * (config.scales[0].candidates - 1)
         self.upsample_mv = Upsample2x(config.feature_channels)
         self.upsample_mono = Upsample2x(config.vit.dim)
 
     def forward(self, encoded: PyramidFeatures, before: DepthStageOutput, cameras: Cameras) -> DepthStageOutput:
-        """Encoded views and the first scale -> inverse depth at twice its resolution."""
+        """Encoder features and the first scale -> inverse depth at twice its resolution."""
         mv = self.upsample_mv(encoded.features_mv)
-        # As in the releases, this scale learns nothing through where the one before made it search.
+        # As in the releases, no gradient flows through the candidates to the scale before.
         coarse_inverse_depth = resize(before.inverse_depth, *mv.shape[2:]).detach()
         candidates = self.candidates_around(coarse_inverse_depth, cameras)
         mono = self.upsample_mono(encoded.features_mono)
@@ -121,7 +127,7 @@ class FineDepth(DepthStage):
         return DepthStageOutput(mv, inverse_depth, probability, full)
 
     def candidates_around(self, coarse_inverse_depth: Tensor, cameras: Cameras) -> Tensor:
-        """Candidates [views, candidates, h, w], evenly spaced around it within the cameras' range."""
+        """Evenly spaced candidates [views, candidates, h, w] around the coarse inverse depth, in the depth range."""
         farthest, nearest = cameras.inverse_range()
         interval = (nearest - farthest) / self.intervals
         half = self.candidates // 2

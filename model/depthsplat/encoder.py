@@ -1,4 +1,4 @@
-"""DepthSplat's encoder."""
+"""DepthSplat's encoder: CNN, matching and ViT features, with the maps that its upsamplers read."""
 
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ MONO_STRIDE = 8
 
 
 class PyramidFeatures(NamedTuple):
-    """DepthSplat's encoder's maps; h and w are the image's size over the feature stride."""
+    """What the encoder returns; h and w are the image's size over the feature stride."""
 
     neighbours: Tensor  # [views, n], the views that each is matched with
     features_cnn: Tensor  # [views, feature channels, h, w]
@@ -23,7 +23,7 @@ class PyramidFeatures(NamedTuple):
     features_cnn_finest: Tensor  # [views, fine channels, H / 2, W / 2]
     features_mv: Tensor  # [views, feature channels, h, w]
     features_mono: Tensor  # [views, ViT channels, h, w]
-    # The four tapped blocks, each [views, ViT channels, patch rows, patch columns].
+    # The ViT's maps at `out_indices`, each [views, ViT channels, patch rows, patch columns].
     mono_1: Tensor
     mono_2: Tensor
     mono_3: Tensor
@@ -31,22 +31,22 @@ class PyramidFeatures(NamedTuple):
 
 
 class PyramidEncoder(ViewEncoder):
-    """DepthSplat's: it hands on the maps of every resolution, for upsampling what is predicted."""
+    """It returns the maps of every resolution, which the upsamplers of depth and features read."""
 
     def __init__(self, config: DepthSplatConfig) -> None:
         super().__init__(config)
         self.vit = DinoV2(config.vit)
-        # The releases bring the ViT's maps to this stride first, and from there to a finer feature stride.
-        self.growth = MONO_STRIDE // config.feature_stride
+        # The releases resize the ViT's maps to this stride first, and from there to a finer feature stride.
+        self.upsampling = MONO_STRIDE // config.feature_stride
 
     def forward(self, images: Tensor, extrinsics: Tensor) -> PyramidFeatures:
-        """Images [views, 3, H, W] in [0, 1], extrinsics [views, 4, 4] -> the encoder's maps."""
+        """Images [views, 3, H, W] in [0, 1], extrinsics [views, 4, 4] -> the encoder's features."""
         neighbours = nearest_views(extrinsics, self.neighbours)
         images = normalize_images(images)
         cnn, cnn_fine, cnn_finest = self.backbone(images)
         mv = self.transformer(cnn, neighbours)
         maps = self.mono_maps(images)
         mono = resize(maps[-1], images.shape[2] // MONO_STRIDE, images.shape[3] // MONO_STRIDE)
-        if self.growth > 1:
+        if self.upsampling > 1:
             mono = resize(mono, *cnn.shape[2:])
         return PyramidFeatures(neighbours, cnn, cnn_fine, cnn_finest, mv, mono, *maps)

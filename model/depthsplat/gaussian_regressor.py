@@ -21,7 +21,7 @@ class GaussianRegressor(nn.Module):
         features, channels = config.upsampler.features, config.regressor_channels
         self.depth_stride = config.depth_stride
         self.upsampler = Upsampler(config, features)
-        # Image, depth, the best candidate's probability, features.
+        # Image, depth, the largest probability of a candidate (match confidence), features.
         self.regressor1 = nn.Conv2d(3 + 1 + 1 + features, channels, 3, padding=1)
         self.regressor2 = nn.Conv2d(channels, channels, 3, padding=1)
         parameters = BASE_PARAMETERS + 3 * config.sh_coefficients
@@ -32,7 +32,7 @@ class GaussianRegressor(nn.Module):
     def forward(
         self, images: Tensor, cameras: Cameras, encoded: PyramidFeatures, scales: tuple[DepthStageOutput, ...]
     ) -> ModelOutput:
-        """Images [views, 3, H, W] in [0, 1] and all that is known of them -> depth and Gaussians."""
+        """Images [views, 3, H, W] in [0, 1], and what the stages before returned -> depth and Gaussians."""
         depth = 1 / scales[-1].inverse_depth_full
         features = self.upsampler(encoded, [scale.features_mv for scale in scales])
         certainty = scales[-1].probability.amax(1, keepdim=True)

@@ -1,10 +1,10 @@
-"""DepthSplat: posed photographs to depth and Gaussians in one pass.
+"""DepthSplat: posed images to depth and Gaussians in one forward pass.
 
-Read beside `idesplat.py`. What the two share is written once: CNN, multi-view transformer and ViT (encoder.py), the
-U-Net that regularises costs (unet.py), dense prediction (dpt.py), and Gaussians from depth and raw parameters
-(gaussian_adapter.py). They part where depth is found, here by sweeping planes at one scale or two (depth_stage.py),
-there by attention along epipolar lines, three times over (dpbu.py); and where it is brought to image size, here by DPT
-heads (upsampler.py, gaussian_regressor.py), there by window attention over shuffled pixels (gaussian_head.py).
+It shares with IDESplat, in model/common: CNN, multi-view transformer and ViT (encoder.py), the U-Net that regularises
+costs (unet.py), dense prediction (dpt.py), and Gaussians from depth and raw parameters (gaussian_adapter.py). The two
+differ in depth estimation: a plane-sweep cost volume at one or two scales here (depth_stage.py), three DPBUs of
+epipolar attention there (dpbu.py). They also differ in upsampling: DPT heads here (upsampler.py,
+gaussian_regressor.py), window attention over unshuffled pixels there (gaussian_head.py).
 """
 
 from torch import Tensor
@@ -34,7 +34,7 @@ class DepthScales(Network):
             self.depth2 = FineDepth(config)
 
     def depth_stages(self, images: Tensor, cameras: Cameras) -> tuple[PyramidFeatures, tuple[DepthStageOutput, ...]]:
-        """The encoded views and what each scale yields, coarsest first."""
+        """The encoder's features and what each scale returns, coarsest first."""
         encoded = self.encoder(images, cameras.extrinsics)
         if len(self.config.scales) == 1:
             return encoded, (self.depth(encoded, cameras),)
@@ -43,7 +43,7 @@ class DepthScales(Network):
 
 
 class DepthSplat(DepthScales):
-    """The whole network; its parts are the stages that export, manifest and parity report name.
+    """The network. Its child modules are the stages, by the names of graph files, manifest and parity report.
 
     images ── encoder ── depth1 ── depth2 ── gaussians ── depth, means, scales, quats, opacities, sh
                  │  1/stride │  2/stride │     │
@@ -59,20 +59,20 @@ class DepthSplat(DepthScales):
     def stages(
         self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor, near: Tensor, far: Tensor
     ) -> tuple[PyramidFeatures, *tuple[DepthStageOutput, ...], ModelOutput]:
-        """What each stage yields, in order, for parity and for training with every stage supervised."""
+        """What each stage returns, in order, for parity and for training with every stage supervised."""
         cameras = Cameras(extrinsics, intrinsics, near, far)
         encoded, scales = self.depth_stages(images, cameras)
         return encoded, *scales, self.gaussians(images, cameras, encoded, scales)
 
 
 class DepthSplatDepth(DepthScales):
-    """DepthSplat without Gaussians, as the depth-only checkpoints have it: the last scale's depth is the result."""
+    """DepthSplat without Gaussians, for the depth-only checkpoints: the output is the last scale's depth."""
 
     has_gaussians = False
 
     def stages(
         self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor, near: Tensor, far: Tensor
     ) -> tuple[PyramidFeatures, *tuple[DepthStageOutput, ...], DepthOutput]:
-        """What each stage yields, in order, for parity and for training with every stage supervised."""
+        """What each stage returns, in order, for parity and for training with every stage supervised."""
         encoded, (*before, last) = self.depth_stages(images, Cameras(extrinsics, intrinsics, near, far))
         return encoded, *before, DepthOutput(1 / last.inverse_depth_full[:, 0], last)

@@ -1,4 +1,4 @@
-"""DepthSplat's upsamplers: DPT heads in which the CNN's and the matching features join the ViT's (dpt_head.py)."""
+"""DepthSplat's upsamplers: DPT heads that concatenate CNN and matching features with the ViT's (dpt_head.py)."""
 
 from collections.abc import Sequence
 from typing import TypeVar
@@ -12,7 +12,7 @@ from ..common.layers import resize
 from .config import DepthSplatConfig
 from .encoder import MONO_STRIDE, PyramidFeatures
 
-# Image size over that of the three maps of the pyramid that others join, finest first.
+# Image size over that of the three pyramid maps with which others are concatenated, finest first.
 STRIDES = (2, 4, 8)
 # Channels before the residual of the inverse depth.
 RESIDUAL_CHANNELS = 16
@@ -21,7 +21,7 @@ T = TypeVar("T")
 
 
 class Upsampler(DPT):
-    """All that is known of the views, to features at image size."""
+    """Encoder and matching features to features at image size."""
 
     def __init__(self, config: DepthSplatConfig, features: int, with_depth: bool = False) -> None:
         channels = config.upsampler.channels
@@ -41,27 +41,27 @@ class Upsampler(DPT):
             self.merges.append(nn.Conv2d(joined + count, count, 1))
 
     def forward(self, encoded: PyramidFeatures, joining: list[Tensor]) -> Tensor:
-        """Encoded views, and the maps that join them -> [views, features, H, W].
+        """Encoder features and further maps to concatenate -> [views, features, H, W].
 
-        joining: the matching features of each scale and, where the upsampler takes it, the last scale's inverse depth.
+        joining: the matching features of each scale and, for the depth upsampler, the last scale's inverse depth.
         """
         cnn = (encoded.features_cnn_finest, encoded.features_cnn_fine, encoded.features_cnn)
-        growth = MONO_STRIDE // STRIDES[0]
-        height, width = cnn[0].shape[2] // growth, cnn[0].shape[3] // growth
+        factor = MONO_STRIDE // STRIDES[0]
+        height, width = cnn[0].shape[2] // factor, cnn[0].shape[3] // factor
         mono = (encoded.mono_1, encoded.mono_2, encoded.mono_3, encoded.mono_4)
         # The releases resize before the 1x1 convolution; the two commute, and this order is less work.
         projected = [resize(project(x), height, width) for project, x in zip(self.projects, mono, strict=True)]
         pyramid = self.reassemble(*projected)
         for level, stride in enumerate(STRIDES):
             joined = _at(stride, joining, self.joining_strides)
-            # The finest map comes last in its concatenation, the others before what joins them.
+            # Order of the released weights: the finest map comes last, the others before what is concatenated.
             parts = [*joined, pyramid[level]] if level == 0 else [pyramid[level], *joined]
             pyramid[level] = self.merges[level](torch.cat([*_at(stride, cnn, self.cnn_strides), *parts], dim=1))
         return self.fuse(pyramid)
 
 
 class DepthUpsampler(Upsampler):
-    """The learned part of upsampling the inverse depth: a residual on top of the bilinear one."""
+    """The learned residual of the bilinearly upsampled inverse depth."""
 
     def __init__(self, config: DepthSplatConfig) -> None:
         features = config.upsampler.depth_features
@@ -79,5 +79,5 @@ class DepthUpsampler(Upsampler):
 
 
 def _at(stride: int, items: Sequence[T], strides: Sequence[int]) -> list[T]:
-    """The items that belong to a stride."""
+    """The items of one stride."""
     return [item for item, its_stride in zip(items, strides, strict=True) if its_stride == stride]

@@ -1,4 +1,4 @@
-"""The sizes of IDESplat."""
+"""IDESplat's configuration."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -12,7 +12,7 @@ class PhotoConfig:
 
     # Channels of its pyramid, which is fused at a quarter of the image's size.
     features: int = 32
-    # Channels of the coarsest map as it is handed on.
+    # Channels of the coarsest map in the branch's output.
     channels: int = 64
     # Channels before the single disparity channel.
     disparity_channels: int = 16
@@ -24,14 +24,14 @@ class DPBUConfig:
 
     channels: int
     candidates: int
-    # The unit's resolution over that of the first unit, and the division of the candidates' interval that goes with it.
+    # Resolution over that of the first DPBU; the candidates' range is narrower by the same factor.
     scale: int
     unet: UNetConfig
 
 
 @dataclass(frozen=True)
 class FocusConfig:
-    """The Gaussian focused module: window attention that keeps ever fewer neighbours."""
+    """The Gaussian focused module: window attention that keeps fewer neighbours from layer to layer."""
 
     channels: int = 256
     heads: int = 4
@@ -42,7 +42,7 @@ class FocusConfig:
 
 @dataclass(frozen=True)
 class IDESplatConfig(EncoderConfig):
-    """IDESplat. The defaults are the released RealEstate10K network; the other presets differ as `PRESETS` says."""
+    """IDESplat. The defaults are the released RealEstate10K network; presets.py has the others."""
 
     dpt: DPTConfig = field(default=DPTConfig())
     # In place of the ViT and its DPT head.
@@ -57,12 +57,12 @@ class IDESplatConfig(EncoderConfig):
     ffn_ratio: int = 2
     ffn_kernel: int = 5
     focus: FocusConfig = FocusConfig()
-    # Hidden channels of the Gaussian head's second input, what other views show at a pixel's place; 0: it has none.
+    # Hidden channels of the head that compares a pixel with its projections in other views; 0: no such head.
     cross_view_channels: int = 0
 
     @property
     def unets(self) -> Iterator[tuple[int, UNetConfig]]:
-        """Those of the three units."""
+        """The U-Nets of the three DPBUs."""
         return ((unit.scale, unit.unet) for unit in self.dpbus)
 
     @property

@@ -1,4 +1,8 @@
-"""What the neighbouring views show where a pixel's depth puts it: the Gaussian head's knowledge of agreement."""
+"""Comparison of each pixel with its projections in the neighbouring views, as an input of the Gaussian head.
+
+With w the pixel's inverse depth as seen from a neighbour and w' what the neighbour predicts there, the agreement is
+1 / (1 + ((w' / w - 1) / TOLERANCE)^2), zero outside the neighbour's image.
+"""
 
 import torch
 import torch.nn.functional as F
@@ -8,49 +12,49 @@ from ..common.bilinear import bordered, corners_around, interpolate
 from ..common.geometry import Cameras, denormalize_intrinsics, project_points
 from ..common.layers import repeat_views, to_tokens
 
-# Inverse depths that differ by this share of theirs agree half-way.
+# Relative difference of inverse depth at which the agreement is one half.
 TOLERANCE = 0.02
-# Differences of inverse depth, relative to the pixel's own, are clipped to this.
+# Relative differences of inverse depth are clipped to this.
 LARGEST_DIFFERENCE = 0.5
-# Colour difference of the views that agree, that of all, difference of inverse depth, agreement, and how many see it.
+# Colour difference weighted by agreement, unweighted, difference of inverse depth, agreement, visibility.
 CHANNELS = 3 + 3 + 1 + 1 + 1
 
 
 def cross_view_features(images: Tensor, inverse_depth: Tensor, cameras: Cameras, neighbours: Tensor) -> Tensor:
-    """Compare each pixel with what its neighbours show at its place in space, [views, CHANNELS, H, W].
+    """Features of the comparison, averaged over the neighbours: [views, CHANNELS, H, W].
 
-    images: [views, 3, H, W] in [0, 1]. inverse_depth: [views, 1, H, W]. neighbours: [views, n]; what they show is
-    averaged. Nothing here is differentiated with respect to where a pixel falls.
+    images: [views, 3, H, W] in [0, 1]. inverse_depth: [views, 1, H, W]. neighbours: [views, n]. Positions of the
+    projections have no gradient.
     """
     views, _, height, width = images.shape
-    x, y, there = _places(inverse_depth, cameras, neighbours)  # [pairs, 1, H * W]
+    x, y, projected = _project(inverse_depth, cameras, neighbours)  # [pairs, 1, H * W]
     inside = torch.ones_like(inverse_depth)
     shown = _sample(torch.cat([images, inverse_depth, inside], dim=1), neighbours, x, y)  # [pairs, 5, H * W]
     colours, surface, inside = shown.split((3, 1, 1), dim=1)
     own = repeat_views(images.flatten(2), neighbours.shape[1])
     colour = colours - inside * own
-    difference = (surface / there.clamp(min=torch.finfo(there.dtype).tiny) - inside).clamp(
+    difference = (surface / projected.clamp(min=torch.finfo(projected.dtype).tiny) - inside).clamp(
         -LARGEST_DIFFERENCE, LARGEST_DIFFERENCE
     )
     agreement = inside / (1 + (difference / TOLERANCE).square())
     pairs = torch.cat([agreement * colour, colour, difference, agreement, inside], dim=1)
     total = pairs.reshape(views, -1, CHANNELS, height * width).sum(1)  # over the neighbours
     agreeing, rest = total.split((3, CHANNELS - 3), dim=1)
-    # The view itself agrees with itself: the mean colour of all that agree, less its own.
+    # Mean colour of the views that agree, less the view's own; the view itself counts as one of them.
     consensus = agreeing / (1 + rest[:, 4:5])
     return torch.cat([consensus, rest / neighbours.shape[1]], dim=1).reshape(views, CHANNELS, height, width)
 
 
 @torch.no_grad()
-def _places(inverse_depth: Tensor, cameras: Cameras, neighbours: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Where pixels fall in each neighbour, x and y, and their inverse depth there, each [views * n, 1, H * W].
+def _project(inverse_depth: Tensor, cameras: Cameras, neighbours: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Projections in each neighbour, x and y, and the inverse depth there, each [views * n, 1, H * W].
 
-    What falls outside or behind the camera is brought to where the border of zeros is.
+    Positions outside the image or behind the camera are clamped to the border of zeros.
     """
     height, width = inverse_depth.shape[2:]
     pixels = denormalize_intrinsics(cameras.intrinsics, height, width)
-    x, y, there, front = project_points(inverse_depth, pixels, cameras.extrinsics, neighbours)
-    return torch.where(front, x, -1.0).clamp(-1, width), torch.where(front, y, -1.0).clamp(-1, height), there
+    x, y, projected, front = project_points(inverse_depth, pixels, cameras.extrinsics, neighbours)
+    return torch.where(front, x, -1.0).clamp(-1, width), torch.where(front, y, -1.0).clamp(-1, height), projected
 
 
 def _sample(maps: Tensor, neighbours: Tensor, x: Tensor, y: Tensor) -> Tensor:

@@ -1,6 +1,15 @@
-"""A depth probability boosting unit: two epipolar attention layers whose probabilities multiply (IDESplat, section 2).
+"""Depth probability boosting units (DPBUs): epipolar attention layers whose probabilities multiply.
 
-Three of them run from coarse to fine, each in a narrower range around the inverse depth of the one before.
+IDESplat, section 2. Over the M = 2 layers of a DPBU, with A_m the depth probability of layer m,
+
+    P_0 = 1,    P_m = Norm(P_{m-1} * A_m),
+
+so that candidates on which the layers agree gain probability. Norm makes the candidates' probabilities sum to one. The
+expected inverse depth is sum_m P(x, m) d_m.
+
+Section 3: three DPBUs run from coarse to fine, at twice the resolution each time, with candidates in a narrower range
+around the inverse depth of the DPBU before. (The paper adds an expected offset to that inverse depth. The released
+code, and this, takes the expectation over absolute inverse depths: the same where the probabilities sum to one.)
 """
 
 from typing import NamedTuple
@@ -16,10 +25,10 @@ from .epipolar_attention import EpipolarAttention
 
 
 class DPBUOutput(NamedTuple):
-    """What a unit hands to the next."""
+    """What a DPBU returns."""
 
     features: Tensor  # [views, channels, h, w] after the attention
-    context: Tensor  # [views, context channels, h, w] before it, refined along from unit to unit
+    context: Tensor  # [views, context channels, h, w] before it, upsampled from DPBU to DPBU
     inverse_depth_first: Tensor  # [views, 1, h, w] after the first layer alone
     inverse_depth: Tensor  # [views, 1, h, w]
     probability: Tensor  # [views, candidates, h, w], mean over the neighbours
@@ -27,7 +36,7 @@ class DPBUOutput(NamedTuple):
 
 
 class DPBU(nn.Module):
-    """The part that all three units share."""
+    """A depth probability boosting unit: the part that all three share."""
 
     def __init__(self, config: IDESplatConfig, unit: DPBUConfig) -> None:
         super().__init__()
@@ -44,7 +53,11 @@ class DPBU(nn.Module):
         neighbours: Tensor,
         cameras: Cameras,
     ) -> DPBUOutput:
-        """Run two layers over the same warp indices, starting from `features` and `coarse_inverse_depth`."""
+        """Run two WIEA layers over the same warp indices.
+
+        features: [views, channels, h, w]. context: passed on. coarse_inverse_depth: [views, 1, h, w].
+        candidates: inverse depths, [views, candidates, h, w]. neighbours: [views, n].
+        """
         height, width = features.shape[2:]
         pixels = denormalize_intrinsics(cameras.intrinsics, height, width)
         rows = warp_indices(candidates, pixels, cameras.extrinsics, neighbours)
@@ -56,7 +69,7 @@ class DPBU(nn.Module):
 
 
 class CoarseDPBU(DPBU):
-    """The first unit: it searches the whole range, and starts from the encoder's features and monocular disparity."""
+    """The first DPBU: candidates over the whole range; its coarse inverse depth is the monocular disparity."""
 
     def __init__(self, config: IDESplatConfig, unit: DPBUConfig) -> None:
         super().__init__(config, unit)
@@ -64,7 +77,7 @@ class CoarseDPBU(DPBU):
         self.merge = ConcatConv1x1(parts, unit.channels)
 
     def forward(self, encoded: EncoderFeatures, cameras: Cameras) -> DPBUOutput:
-        """Encoded views -> features and inverse depth at the encoder's resolution."""
+        """Encoder features -> features and inverse depth at the encoder's resolution."""
         size = encoded.features_cnn.shape[2:]
         at_size = [encoded.features_cnn, encoded.features_mv, encoded.features_mono]
         context = self.merge(at_size, [encoded.mono_out], *size)
@@ -75,23 +88,23 @@ class CoarseDPBU(DPBU):
 
 
 class RefinementDPBU(DPBU):
-    """The second or third unit: twice the resolution, candidates around the inverse depth of the unit before."""
+    """The second or third DPBU: twice the resolution, candidates around the inverse depth of the DPBU before."""
 
     def __init__(self, config: IDESplatConfig, unit: DPBUConfig, before: DPBUConfig, context: int) -> None:
-        """`before` is the previous unit, `context` the channels of its context."""
+        """before: the previous DPBU's configuration. context: the channels of its context."""
         super().__init__(config, unit)
-        # The coarse unit's intervals, and by how much this unit's are narrower.
+        # Intervals of the candidates' spacing in the whole range: the coarse DPBU's, divided by the scale.
         self.intervals = (config.dpbus[0].candidates - 1) * unit.scale
         self.upsample_features = Upsample2x(before.channels)
         self.upsample_context = Upsample2x(context)
-        # The CNN has a map of the second unit's resolution itself; only the third must grow it.
+        # The CNN has a map at the second DPBU's resolution; the third upsamples it.
         cnn = config.backbone_channels[1]
         self.upsample_cnn = Upsample2x(cnn) if unit.scale > 2 else nn.Identity()
         cnn = cnn // 2 if unit.scale > 2 else cnn
         self.merge = ConcatConv1x1((before.channels // 2, context // 2, cnn, *config.mono_channels), unit.channels)
 
     def forward(self, encoded: EncoderFeatures, before: DPBUOutput, cameras: Cameras) -> DPBUOutput:
-        """Encoded views and the unit before -> features and inverse depth at twice its resolution."""
+        """Encoder features and the DPBU before -> features and inverse depth at twice its resolution."""
         context = self.upsample_context(before.context)
         size = context.shape[2:]
         at_size = [self.upsample_features(before.features), context, self.upsample_cnn(encoded.features_cnn_fine)]
@@ -101,7 +114,7 @@ class RefinementDPBU(DPBU):
         return self.boost(features, context, coarse_inverse_depth, candidates, encoded.neighbours, cameras)
 
     def candidates_around(self, coarse_inverse_depth: Tensor, cameras: Cameras) -> Tensor:
-        """Candidates [views, candidates, h, w], evenly spaced around it within the cameras' range."""
+        """Evenly spaced candidates [views, candidates, h, w] around the coarse inverse depth, in the depth range."""
         farthest, nearest = cameras.inverse_range()
         half = (self.candidates - 1) / 2
         reach = (nearest - farthest) / self.intervals * half
@@ -114,7 +127,10 @@ class RefinementDPBU(DPBU):
 
 
 def expectation(probability: Tensor, candidates: Tensor) -> tuple[Tensor, Tensor]:
-    """Probabilities [pairs, candidates, h * w] -> expected inverse depth and probabilities, by view as maps."""
+    """Expected inverse depth [views, 1, h, w] and mean probability over the neighbours, [views, candidates, h, w].
+
+    probability: [pairs, candidates, h * w]. candidates: inverse depths, [views, candidates, h, w].
+    """
     views, _, height, width = candidates.shape
     count = static_dim(candidates.shape[1])
     probability = probability.reshape(views, -1, count, height * width).mean(1).reshape(-1, count, height, width)

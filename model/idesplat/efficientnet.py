@@ -1,4 +1,4 @@
-"""EfficientNet-Lite0 up to stride 16: photographic features from ImageNet, with batch normalisation folded away."""
+"""EfficientNet-Lite0 up to stride 16, with ImageNet weights whose batch normalisation is folded into convolutions."""
 
 import torch
 import torch.nn.functional as F

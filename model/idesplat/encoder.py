@@ -1,4 +1,4 @@
-"""IDESplat's encoder."""
+"""IDESplat's encoder: CNN and matching features, and a monocular branch with its relative disparity."""
 
 from typing import NamedTuple
 
@@ -14,19 +14,19 @@ from .photographic_branch import PhotoBranch
 
 
 class EncoderFeatures(NamedTuple):
-    """IDESplat's encoder's maps; h and w are the image's size over the feature stride."""
+    """What the encoder returns; h and w are the image's size over the feature stride."""
 
     neighbours: Tensor  # [views, n], the views that each is matched with
     features_cnn: Tensor  # [views, feature channels, h, w]
     features_cnn_fine: Tensor  # [views, cnn channels, 2h, 2w]
     features_mv: Tensor  # [views, feature channels, h, w]
     features_mono: Tensor  # [views, ViT channels, h, w]
-    mono_out: Tensor  # [views, DPT channels, 8 * patch rows, 8 * patch columns]; of photographic features h, w
+    mono_out: Tensor  # [views, DPT channels, 8 * patch rows, 8 * patch columns]; without the ViT h, w
     mono_disparity: Tensor  # [views, 1, h, w], relative
 
 
 class Encoder(ViewEncoder):
-    """IDESplat's: Depth Anything V2 is the monocular branch, with its head, or else photographic features."""
+    """Its monocular branch is Depth Anything V2 with its DPT head, or EfficientNet-Lite0 (photographic_branch.py)."""
 
     def __init__(self, config: IDESplatConfig) -> None:
         super().__init__(config)
@@ -36,7 +36,7 @@ class Encoder(ViewEncoder):
             self.dpt = DPTHead(config.vit.dim, config.vit.patch, config.dpt)
 
     def forward(self, images: Tensor, extrinsics: Tensor) -> EncoderFeatures:
-        """Images [views, 3, H, W] in [0, 1], extrinsics [views, 4, 4] -> the encoder's maps."""
+        """Images [views, 3, H, W] in [0, 1], extrinsics [views, 4, 4] -> the encoder's features."""
         neighbours = nearest_views(extrinsics, self.neighbours)
         normalised = normalize_images(images)
         cnn, cnn_fine, _ = self.backbone(normalised)

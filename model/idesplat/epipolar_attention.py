@@ -1,6 +1,15 @@
-"""One warp-index epipolar attention layer: pixels attend to where their depth candidates fall in other views.
+"""Warp-index epipolar attention (WIEA): pixels attend to the projections of their depth candidates in other views.
 
-The releases multiply sparsely in a CUDA extension; here the same sums run over gathered rows (sparse_products.py).
+IDESplat, section 2. With the warp index I(x, m) of pixel x at candidate m (geometry.warp_indices), the correlation is
+
+    C(x, m) = <Q(x), K(I(x, m))>,
+
+with queries Q and keys K projected from the features of both views. A 2D U-Net refines C, and
+
+    A(x, m) = softmax_m(U(C)(x, m))
+
+is the layer's depth probability. The releases compute C, and the sum of values V weighted by A, as sparse matrix
+products in a CUDA extension; here the same sums run over gathered rows (common/gather_attention.py).
 """
 
 import torch
@@ -11,19 +20,19 @@ from ..common.layers import ConvFFN, repeat_views, static_dim, to_map, to_tokens
 from ..common.unet import CostRegulariser
 from .config import DPBUConfig, IDESplatConfig
 
-# Keeps the renormalised product of probabilities away from zero.
+# Keeps the normalised product of probabilities away from zero.
 EPSILON = 1e-10
 
 
 class EpipolarAttention(nn.Module):
-    """Warp-index epipolar attention (IDESplat, section 2)."""
+    """One WIEA layer, with the position embeddings and the feed-forward layer of the releases."""
 
     def __init__(self, network: IDESplatConfig, unit: DPBUConfig) -> None:
         super().__init__()
         channels, candidates = unit.channels, unit.candidates
         self.scale = channels**-0.5
         self.gather_attention = GatherAttention(channels * candidates, network.smallest_map(unit.scale))
-        # Position embeddings of the candidates, for keys, values and scores.
+        # Position embeddings of the candidates: one number each, added to keys, values and scores.
         self.key_position = nn.Parameter(torch.zeros(candidates))
         self.value_position = nn.Parameter(torch.zeros(candidates))
         self.score_position = nn.Parameter(torch.zeros(candidates))
@@ -41,12 +50,11 @@ class EpipolarAttention(nn.Module):
     def forward(
         self, features: Tensor, coarse_inverse_depth: Tensor, rows: Tensor, prior: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """Attend along the epipolar lines.
+        """Attend along the epipolar lines; returns features of the same shape and probabilities of the prior's shape.
 
-        features: [views, channels, h, w]; coarse_inverse_depth: what is known of the inverse depth, [views, 1, h, w].
-        rows: warp indices [pairs, candidates, h * w], pairs = views * neighbours (geometry.nearest_pixels).
-        prior: the previous layer's probabilities [pairs, candidates, h * w], which this layer's multiply.
-        Returns features of the same shape and the probabilities.
+        features: [views, channels, h, w]. coarse_inverse_depth: an input of the U-Net, [views, 1, h, w].
+        rows: warp indices [pairs, candidates, h * w], pairs = views * neighbours (geometry.warp_indices).
+        prior: P_{m-1}, the previous layer's probability [pairs, candidates, h * w]; None (1) in a DPBU's first layer.
         """
         views, _, height, width = features.shape
         neighbours = rows.shape[0] // views
@@ -66,7 +74,7 @@ class EpipolarAttention(nn.Module):
             dim=1,
         )
         probability = self.regulariser(known, views).flatten(2)
-        if prior is not None:  # depth probability boosting
+        if prior is not None:  # P_m = Norm(P_{m-1} * A_m), IDESplat, section 2
             product = probability * prior
             probability = (product + EPSILON) / (product.sum(1, keepdim=True) + EPSILON)
 

@@ -1,4 +1,13 @@
-"""The Gaussian focused module: window attention whose layers keep ever fewer neighbours of each pixel."""
+"""The Gaussian focused module (GFM): window attention that keeps fewer neighbours of each pixel from layer to layer.
+
+IDESplat, section 4. Layers alternate between plain and shifted windows. With B the attention of the layer two before,
+which has the same windows (1 in the first two layers), a layer's attention is
+
+    A = top-k(Norm(softmax(Q K^T / sqrt(d) + position bias) * B)).
+
+Neighbours that B has pruned stay pruned: their score is -inf. Weights below the k-th largest are set to zero, without
+renormalisation, as in the released code.
+"""
 
 import torch
 from torch import Tensor, nn
@@ -11,7 +20,7 @@ EPSILON = 1e-10
 
 
 class GaussianFocusedModule(nn.Module):
-    """Layers of plain and shifted windows in turn; each kind hands its attention to the next of its kind."""
+    """Layers with plain and shifted windows in turn; each passes its attention to the next with the same windows."""
 
     def __init__(self, config: FocusConfig, ffn_ratio: int, ffn_kernel: int) -> None:
         super().__init__()
@@ -21,7 +30,7 @@ class GaussianFocusedModule(nn.Module):
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        """[views, channels, h, w] -> the same shape; h and w are padded to windows by reflection and cut again."""
+        """[views, channels, h, w] -> the same shape; h and w are padded by reflection to whole windows, and cropped."""
         height, width = x.shape[2:]
         window = self.window
         padded_height = (height + window - 1) // window * window
@@ -36,10 +45,10 @@ class GaussianFocusedModule(nn.Module):
 
 
 class FocusedLayer(nn.Module):
-    """One layer: window attention times the attention of the layer two before, then a feed-forward network.
+    """One layer of the module, followed by a convolutional feed-forward layer.
 
-    The releases gather the kept neighbours and multiply sparsely. Windows are small, so here the attention stays
-    dense, with zeros where a neighbour has been dropped: the same sums without a custom kernel.
+    The releases gather the kept neighbours in a CUDA kernel. Windows are small, so here the attention stays dense, with
+    zeros where a neighbour is pruned: the same sums with standard operators.
     """
 
     position_index: Tensor
@@ -52,7 +61,7 @@ class FocusedLayer(nn.Module):
         self.shifted = index % 2 == 1
         self.topk = config.topk[index]
         self.prunes = self.topk < (config.topk[index - 2] if index >= 2 else tokens)
-        # Whether the layer before of the same kind has dropped neighbours already.
+        # Whether the layer two before has pruned neighbours.
         self.pruned = index >= 2 and config.topk[index - 2] < tokens
         self.norm1 = nn.LayerNorm(channels)
         self.q_proj = nn.Linear(channels, channels)
@@ -80,11 +89,11 @@ class FocusedLayer(nn.Module):
         return to_map(tokens, height, width), attention
 
     def _attend(self, q: Tensor, k: Tensor, before: Tensor | None, mask: Tensor) -> Tensor:
-        """Attention over the neighbours that are left, the `topk` strongest kept."""
+        """Attention over the neighbours that are left; of these the `topk` strongest stay."""
         scores = (q * self.head_channels**-0.5) @ k.transpose(-1, -2)  # [views, windows, heads, tokens, tokens]
         scores = scores + self.position_bias[self.position_index].permute(2, 0, 1)
         if before is not None and self.pruned:
-            # The releases leave the mask away from here on: what it hid has all but zero weight in `before`.
+            # From here on the releases omit the window mask: what it excluded has next to no weight in `before`.
             scores = torch.where(before > 0, scores, -torch.inf)
         elif self.shifted:
             scores = scores + mask[:, None]
@@ -95,7 +104,7 @@ class FocusedLayer(nn.Module):
                 product = torch.where(before > 0, product, 0.0)
             attention = product / (product.sum(-1, keepdim=True) + EPSILON)
         if self.prunes:
-            # The least of the strongest is found in half the time where they need not be in order.
+            # The k-th largest weight; unsorted top-k takes half the time.
             weakest = attention.topk(self.topk, dim=-1, sorted=False).values.amin(-1, keepdim=True)
             attention = torch.where(attention >= weakest, attention, 0.0)
         return attention

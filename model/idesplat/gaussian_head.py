@@ -1,4 +1,11 @@
-"""The last stage: depth refined once more and fused, and each pixel's raw Gaussian parameters and Gaussian."""
+"""IDESplat's last stage: final depth, focused features, and each pixel's Gaussian.
+
+The final inverse depth is a weighted sum of the three DPBUs' and a residual head's (released code, mv_unimatch.py):
+
+    w = clamp(0.1 w_1 + 0.1 w_2 + 0.4 w_3 + 0.4 w_residual, 1 / far, 1 / near),
+
+each resized bilinearly to the image, and depth = 1 / w.
+"""
 
 from typing import NamedTuple
 
@@ -18,16 +25,16 @@ from .dpbu import DPBUOutput
 from .encoder import EncoderFeatures
 from .focused_attention import GaussianFocusedModule
 
-# Shares of the three units' and the residual head's inverse depth in the final one (mv_unimatch.py).
-DEPTH_SHARES = (0.1, 0.1, 0.4, 0.4)
-# Pixels of a block that become channels, a side.
+# Of the three DPBUs' and the residual head's inverse depth.
+INVERSE_DEPTH_WEIGHTS = (0.1, 0.1, 0.4, 0.4)
+# Side of the pixel blocks that become channels (pixel unshuffle).
 SHUFFLE = 4
-# conv_image's channels are the feature channels over this.
-IMAGE_SHARE = 16
+# Feature channels per channel of conv_image.
+IMAGE_CHANNEL_DIVISOR = 16
 
 
 class HeadInputs(NamedTuple):
-    """What the Gaussian head reads of the stages before it; h and w are the image's size over the feature stride."""
+    """Inputs of the Gaussian head from earlier stages; h and w are the image's size over the feature stride."""
 
     inverse_depth: Tensor  # [views, 1, H, W], the final one
     features_cnn: Tensor  # [views, feature channels, h, w]
@@ -37,7 +44,7 @@ class HeadInputs(NamedTuple):
 
 
 class CrossViewHead(nn.Module):
-    """What other views show at a pixel's place, to a change of its raw parameters; at first there is none."""
+    """A correction of the raw parameters from the neighbouring views (cross_view.py); it starts at zero."""
 
     def __init__(self, channels: int, parameters: int) -> None:
         super().__init__()
@@ -60,7 +67,7 @@ class GaussianStage(nn.Module):
         last, channels = config.dpbus[2], config.feature_channels
         self.residual = CostRegulariser(last.channels + last.candidates + 1, last.candidates, config.residual_unet)
         block = SHUFFLE**2
-        image_channels = channels // IMAGE_SHARE
+        image_channels = channels // IMAGE_CHANNEL_DIVISOR
         fused = (image_channels + last.channels + 1) * block + channels + config.dpbus[0].channels
         self.conv_image = nn.Conv2d(3, image_channels, 1)
         self.fuse = nn.Conv2d(fused, config.focus.channels, 1)
@@ -77,21 +84,21 @@ class GaussianStage(nn.Module):
         images: Tensor,
         cameras: Cameras,
         encoded: EncoderFeatures,
-        units: tuple[DPBUOutput, DPBUOutput, DPBUOutput],
+        dpbus: tuple[DPBUOutput, DPBUOutput, DPBUOutput],
     ) -> ModelOutput:
-        """Images [views, 3, H, W] in [0, 1] and all that is known of them -> depth and Gaussians."""
-        return self.predict(images, cameras, self.head_inputs(images, cameras, encoded, units))
+        """Images [views, 3, H, W] in [0, 1], and what the stages before returned -> depth and Gaussians."""
+        return self.predict(images, cameras, self.head_inputs(images, cameras, encoded, dpbus))
 
     def head_inputs(
         self,
         images: Tensor,
         cameras: Cameras,
         encoded: EncoderFeatures,
-        units: tuple[DPBUOutput, DPBUOutput, DPBUOutput],
+        dpbus: tuple[DPBUOutput, DPBUOutput, DPBUOutput],
     ) -> HeadInputs:
-        """Everything up to the final inverse depth; none of it changes while the Gaussian head alone is trained."""
-        inverse_depth = self.fused_inverse_depth(units, cameras, *images.shape[2:])
-        return HeadInputs(inverse_depth, encoded.features_cnn, units[0].context, units[2].features, encoded.neighbours)
+        """Everything up to the final inverse depth, which stays constant while only the Gaussian head is trained."""
+        inverse_depth = self.fused_inverse_depth(dpbus, cameras, *images.shape[2:])
+        return HeadInputs(inverse_depth, encoded.features_cnn, dpbus[0].context, dpbus[2].features, encoded.neighbours)
 
     def predict(self, images: Tensor, cameras: Cameras, inputs: HeadInputs) -> ModelOutput:
         """Focused module, Gaussian head and adapter."""
@@ -103,17 +110,17 @@ class GaussianStage(nn.Module):
         return ModelOutput(depth, self.adapter(raw, depth, images, cameras), features, raw)
 
     def fused_inverse_depth(
-        self, units: tuple[DPBUOutput, DPBUOutput, DPBUOutput], cameras: Cameras, height: int, width: int
+        self, dpbus: tuple[DPBUOutput, DPBUOutput, DPBUOutput], cameras: Cameras, height: int, width: int
     ) -> Tensor:
-        """The shares of the units and of the residual head, within the cameras' range: [views, 1, height, width]."""
-        last = units[2]
+        """The weighted sum of the DPBUs' and the residual head's inverse depth, clamped: [views, 1, height, width]."""
+        last = dpbus[2]
         known = torch.cat([last.features, last.probability, last.inverse_depth], dim=1)
         probability = self.residual(known, last.features.shape[0])
         residual = (probability * last.candidates).sum(1, keepdim=True)
-        maps = [*(unit.inverse_depth for unit in units), residual]
+        maps = [*(dpbu.inverse_depth for dpbu in dpbus), residual]
         fused = torch.zeros_like(maps[0][:, :, :1, :1])
-        for share, x in zip(DEPTH_SHARES, maps, strict=True):
-            fused = fused + share * resize(x, height, width)
+        for weight, x in zip(INVERSE_DEPTH_WEIGHTS, maps, strict=True):
+            fused = fused + weight * resize(x, height, width)
         farthest, nearest = cameras.inverse_range()
         return torch.minimum(torch.maximum(fused, farthest), nearest)
 

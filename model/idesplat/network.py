@@ -1,6 +1,6 @@
-"""IDESplat: posed photographs to depth and Gaussians in one pass.
+"""IDESplat: posed images to depth and Gaussians in one forward pass.
 
-Read beside `depthsplat.py`, which says what the two share and where they part.
+depthsplat/network.py says what the two networks share and where they differ.
 """
 
 from torch import Tensor
@@ -15,7 +15,7 @@ from .gaussian_head import GaussianStage
 
 
 class IDESplat(Network):
-    """The whole network; its parts are the stages that export, manifest and parity report name.
+    """The network. Its child modules are the stages, by the names of graph files, manifest and parity report.
 
     images ── encoder ── dpbu1 ── dpbu2 ── dpbu3 ── gaussians ── depth, means, scales, quats, opacities, sh
                 │  1/stride │  2/stride │  4/stride │   │
@@ -37,11 +37,11 @@ class IDESplat(Network):
     def stages(
         self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor, near: Tensor, far: Tensor
     ) -> tuple[EncoderFeatures, DPBUOutput, DPBUOutput, DPBUOutput, ModelOutput]:
-        """What each stage yields, in order, for parity and for training with every stage supervised."""
+        """What each stage returns, in order, for parity and for training with every stage supervised."""
         cameras = Cameras(extrinsics, intrinsics, near, far)
         encoded = self.encoder(images, extrinsics)
         first = self.dpbu1(encoded, cameras)
         second = self.dpbu2(encoded, first, cameras)
         third = self.dpbu3(encoded, second, cameras)
-        predicted = self.gaussians(images, cameras, encoded, (first, second, third))
-        return encoded, first, second, third, predicted
+        output = self.gaussians(images, cameras, encoded, (first, second, third))
+        return encoded, first, second, third, output

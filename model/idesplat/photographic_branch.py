@@ -1,4 +1,4 @@
-"""The monocular branch on photographic features: a feature pyramid over EfficientNet-Lite0, and disparity."""
+"""A monocular branch for small networks: a feature pyramid on EfficientNet-Lite0, and relative disparity."""
 
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -7,12 +7,12 @@ from ..common.dpt import TINY, Fusion
 from .config import PhotoConfig
 from .efficientnet import CHANNELS, EfficientNetLite0
 
-# Of the network's maps, the pyramid has those at strides 4, 8 and 16.
+# Of the backbone's maps, the pyramid has those at strides 4, 8 and 16.
 LEVELS = slice(1, 4)
 
 
 class PhotoBranch(nn.Module):
-    """What the ViT and its DPT head are to the other networks."""
+    """In place of the ViT and its DPT head."""
 
     def __init__(self, config: PhotoConfig) -> None:
         super().__init__()
@@ -30,7 +30,7 @@ class PhotoBranch(nn.Module):
         [views, channels, H / 16, W / 16], [views, features, H / 4, W / 4] and [views, 1, H / 4, W / 4], the last in
         [0, 1], with 1 the largest over all views.
         """
-        # The maps' magnitudes differ between images by far; without normalisation a first try of training died.
+        # Magnitudes differ widely between images; a trial of training without this normalisation diverged.
         maps = [F.group_norm(x, 1) for x in self.network(images)[LEVELS]]
         fine, middle, coarse = (lateral(x) for lateral, x in zip(self.laterals, maps, strict=True))
         path = self.fusions[2](coarse, None, *middle.shape[2:])

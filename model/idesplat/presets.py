@@ -5,7 +5,7 @@ from dataclasses import replace
 from ..config import DPTConfig, UNetConfig, ViTConfig
 from .config import DPBUConfig, FocusConfig, IDESplatConfig, PhotoConfig
 
-# Every part in small, for CPUs: 3.0 million parameters, trained from scratch, the ViT along.
+# Every part at a small size, for CPUs: 3.0 million parameters, trained from scratch including the ViT.
 _TINY = IDESplatConfig(
     backbone_channels=(24, 32, 48),
     feature_channels=48,
@@ -22,21 +22,21 @@ _TINY = IDESplatConfig(
     ),
     residual_unet=UNetConfig(channels=8, levels=5),
     focus=FocusConfig(channels=48, window=8, topk=(64, 64, 32, 32)),
-    # Procedural surfaces hardly shine: bands above the first would learn little, and double the .ply file.
+    # Synthetic surfaces are almost diffuse: SH degrees above 1 would learn little, and double the .ply file.
     sh_degree=1,
     scale_in_pixels=True,
-    # Training makes splats at a picture's border as large as they may be, to cover what no view sees; in views
-    # between, they cover what another photograph shows.
+    # Training makes Gaussians at the image border as large as this allows, to cover what no view sees. From views in
+    # between they would occlude what another view shows.
     scale_max=1.5,
-    # Its scenes have the unit in which near is 1, and far lies between 2 and 200.
+    # Its training scenes are scaled so that near is 1; far is then between 2 and 200.
     near=1.0,
     trained_views=(2, 3),
     other_sides=(128,),
 )
-# The same with a Gaussian head that is shown what other views see at a pixel's place.
+# With a head that compares each pixel with its projections in other views.
 _TINY_CROSS_VIEW = replace(_TINY, cross_view_channels=16)
-# That on photographic features, and without maps of many pixels and few channels: 2.5 million parameters, and 0.7
-# million of EfficientNet-Lite0.
+# With EfficientNet-Lite0 features in place of the ViT, and without large maps of few channels: 2.5 million parameters,
+# and 0.7 million of EfficientNet-Lite0.
 _LITE = replace(
     _TINY_CROSS_VIEW,
     photo=PhotoConfig(),

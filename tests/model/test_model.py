@@ -92,7 +92,7 @@ def test_quaternions_give_their_matrices_back():
     torch.testing.assert_close(torch.stack([torch.stack(r, -1) for r in rows], -2), rotations, atol=1e-5, rtol=0)
 
 
-def test_nearest_pixels_see_a_plane_where_it_is():
+def test_warp_indices_see_a_plane_where_it_is():
     """A plane at depth 2 before two cameras 0.5 apart: the right candidate moves a pixel by f * 0.5 / 2."""
     intrinsics = torch.tensor([[16.0, 0, 8], [0, 16, 8], [0, 0, 1]]).repeat(2, 1, 1)
     extrinsics = torch.eye(4).repeat(2, 1, 1)
