@@ -48,8 +48,8 @@ class Regions(NamedTuple):
     """The contiguous regions of windows [rows, columns] that are shifted by half, with `splits` windows a side.
 
     The shift brings tokens from opposite borders into the last window of each axis, whose halves must not attend to
-    each other. Attention within regions computes what a mask over whole windows does, with 9/16 of the multiplications for
-    two splits. Windows form four groups: neither axis in halves, columns, rows, both.
+    each other. Attention within regions computes what a mask over whole windows does, with 9/16 of the multiplications
+    for two splits. Windows form four groups: neither axis in halves, columns, rows, both.
     """
 
     splits: int
