@@ -129,7 +129,7 @@ def train(
             on_step=on_step,
         )
     say(
-        f"{out / CHECKPOINT}: the trained network, for idesplat-export; {out / LOG}: loss and metrics of every step",
+        f"{out / CHECKPOINT}: the trained network, for idesplat export; {out / LOG}: loss and metrics of every step",
         f"{out / CURVES}: curves; {out / PREDICTIONS}: image, truth, prediction and error of validation scenes",
     )
 

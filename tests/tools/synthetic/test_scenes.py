@@ -1,4 +1,4 @@
-"""Procedural scenes: exact depth, cameras that agree with the pictures, seeds that keep apart."""
+"""Synthetic scenes: exact depth, consistent views, disjoint seeds."""
 
 from itertools import pairwise
 
@@ -46,8 +46,8 @@ def scene_of(*solids: tuple[int, tuple[float, ...], tuple[float, ...], np.ndarra
     )
 
 
-def turned(degrees: float) -> np.ndarray:
-    """Axes turned about y."""
+def rotation_about_y(degrees: float) -> np.ndarray:
+    """Axes rotated about y."""
     cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]])
 
@@ -70,7 +70,7 @@ def test_depth_of_walls_is_analytic() -> None:
 
 
 def test_depth_of_solids_is_analytic() -> None:
-    """The middle pixel looks along z at solids whose front is known; z-depth, not distance, in the other pixels."""
+    """The centre pixel looks along z at solids of known extent; a card has one z-depth, not one distance."""
     straight = np.array([[1.0, 0, 0.5], [0, 1.0, 0.5], [0, 0, 1]])
     fronts = {
         (BOX, 0.0): 4 - 0.5,
@@ -79,7 +79,7 @@ def test_depth_of_solids_is_analytic() -> None:
         (CYLINDER, 90.0): 4 - 1.5,
     }
     for (shape, degrees), expected in fronts.items():
-        scene = scene_of((shape, (0.0, 0.0, 4.0), (1.5, 0.8, 0.5), turned(degrees)))
+        scene = scene_of((shape, (0.0, 0.0, 4.0), (1.5, 0.8, 0.5), rotation_about_y(degrees)))
         _, depth = render(scene, GREY, np.eye(4), straight, 33, 33, 0)
         assert depth[16, 16] == pytest.approx(expected, rel=1e-6), (shape, degrees)
     # A card that faces the camera has one z-depth all over.
@@ -89,7 +89,7 @@ def test_depth_of_solids_is_analytic() -> None:
     assert (depth == np.float32(3.99)).mean() == pytest.approx((2 / 3.99) ** 2, rel=0.05)
 
 
-def test_lamp_casts_a_shadow_below_a_solid() -> None:
+def test_solid_casts_the_analytic_shadow() -> None:
     above = look_at(np.array([0.0, 0.0, -8.0]), np.array([0.0, 9.0, 0.0]))
     square = np.array([[1.0, 0, 0.5], [0, 1.0, 0.5], [0, 0, 1]])
     ball = scene_of((ELLIPSOID, (0.0, -4.0, 0.0), (2.0, 1.0, 2.0), np.eye(3)))
@@ -105,7 +105,7 @@ def test_lamp_casts_a_shadow_below_a_solid() -> None:
     assert not shaded[on_floor & (from_middle > 1.03 * 19 * slope)].any()
 
 
-def test_same_seed_same_sample_other_seed_another() -> None:
+def test_sample_depends_on_the_seed_alone() -> None:
     first, again, other = (generate_sample(seed, 2, 1, 32, 48) for seed in (7, 7, 8))
     for name in ("images", "depth", "extrinsics", "intrinsics", "near", "far"):
         np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
@@ -114,7 +114,7 @@ def test_same_seed_same_sample_other_seed_another() -> None:
 
 
 def test_zoomed_target_is_a_crop_of_the_larger_image() -> None:
-    """Context and cameras stay; every pixel of the window shows what the large picture shows there."""
+    """Context and cameras are unchanged; the crop shows the same depth as the larger image."""
     plain, zoomed = (generate_sample(7, 2, 2, 64, 96, target_zooms=times) for times in ((), (1, 3)))
     large = generate_sample(7, 2, 2, 3 * 64, 3 * 96)
     assert np.array_equal(plain.extrinsics[:, :3, :3], zoomed.extrinsics[:, :3, :3])
@@ -151,28 +151,28 @@ def test_samples_are_well_formed() -> None:
 
 
 def warped(sample: Sample, source: int, target: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Source's points in target's image: pixel places [points, 2] within it, z-depths and source colours."""
+    """Source's points projected into target: pixels [points, 2] inside the image, z-depths, colors, and a mask."""
     height, width = sample.depth.shape[1:]
     points = pixel_rays(sample.intrinsics[source], height, width) * sample.depth[source][..., None]
-    moved = np.linalg.inv(sample.extrinsics[target].astype(np.float64)) @ sample.extrinsics[source]
-    points = points.reshape(-1, 3) @ moved[:3, :3].T + moved[:3, 3]
+    relative = np.linalg.inv(sample.extrinsics[target].astype(np.float64)) @ sample.extrinsics[source]
+    points = points.reshape(-1, 3) @ relative[:3, :3].T + relative[:3, 3]
     projected = points @ sample.intrinsics[target].T
-    places = projected[:, :2] / projected[:, 2:] * (width, height) - 0.5
-    inside = ((places > 0) & (places < (width - 1.001, height - 1.001))).all(axis=1) & (points[:, 2] > 0)
+    pixels = projected[:, :2] / projected[:, 2:] * (width, height) - 0.5
+    inside = ((pixels > 0) & (pixels < (width - 1.001, height - 1.001))).all(axis=1) & (points[:, 2] > 0)
     colors = sample.images[source].reshape(3, -1).T
-    return places[inside], points[inside, 2], colors[inside], inside
+    return pixels[inside], points[inside, 2], colors[inside], inside
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3, 4, 5, 6])
-def test_views_agree_where_depth_says_so(seed: int) -> None:
-    """A pixel moved by its depth meets the other view's depth and colour, or is hidden there, but floats nowhere."""
+def test_views_are_consistent_under_their_depth(seed: int) -> None:
+    """A reprojected pixel has the other view's depth and color, or is occluded there; none lies in front."""
     sample = generate_sample(seed, 1, 2, 96, 96)
-    places, z, colors, inside = warped(sample, 1, 2)
+    pixels, z, colors, inside = warped(sample, 1, 2)
     assert inside.mean() > 0.3
-    column, row = places.astype(int).T
+    column, row = pixels.astype(int).T
     corners = [(row + i, column + j) for i in (0, 1) for j in (0, 1)]
     around = np.stack([sample.depth[2][corner] for corner in corners])
-    fu, fv = places.T - (column, row)
+    fu, fv = pixels.T - (column, row)
     weights = np.stack([(1 - fv) * (1 - fu), (1 - fv) * fu, fv * (1 - fu), fv * fu])
     # Inverse depth is linear across the image of a plane, so that interpolating it is exact there.
     smooth = np.ptp(np.log(around), axis=0) < 0.05
@@ -187,8 +187,8 @@ def test_views_agree_where_depth_says_so(seed: int) -> None:
     assert difference.mean() < 0.4 * unrelated.mean()
 
 
-def test_more_samples_come_closer_to_the_true_colour() -> None:
-    """Antialiasing: one ray in a pixel is worse than four, and four are close to many."""
+def test_more_rays_per_pixel_reduce_the_error() -> None:
+    """Antialiasing: four rays are better than one, and close to 64."""
     bank = scene_textures(0)
     rng = np.random.default_rng(0)
     layout = furnished_room(rng, bank)
@@ -199,7 +199,7 @@ def test_more_samples_come_closer_to_the_true_colour() -> None:
     assert error_of_four < 0.03
 
 
-def test_reported_seeds_share_nothing_with_training() -> None:
+def test_training_and_reported_seeds_are_disjoint() -> None:
     assert len(HELD_OUT_SEEDS) == 200
     ranges = sorted([TRAINING_SEEDS, VALIDATION_SEEDS, HELD_OUT_SEEDS], key=lambda seeds: seeds.start)
     assert all(before.stop <= after.start for before, after in pairwise(ranges))
@@ -209,7 +209,7 @@ def test_reported_seeds_share_nothing_with_training() -> None:
     assert scene_textures(VALIDATION_SEEDS[0]) is scene_textures(HELD_OUT_SEEDS[0])
 
 
-def test_textures_tile_and_have_levels() -> None:
+def test_textures_tile_and_have_mipmaps() -> None:
     bank = texture_bank(3, 26)
     start = 0
     means = []

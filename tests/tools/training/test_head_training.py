@@ -1,4 +1,4 @@
-"""The Gaussian head trained alone: what is frozen stays, features are computed once, opacity is taken off its limit."""
+"""Training of the Gaussian head alone: frozen parts, cached features, reset of saturated opacities."""
 
 from collections import Counter
 from dataclasses import replace
@@ -40,13 +40,13 @@ def cache(tmp_path: Path) -> FeatureCache:
     return FeatureCache(tmp_path / "cache", new_model(CONFIG, seed=0), generate_views, "test")
 
 
-def test_every_scene_comes_once_an_epoch() -> None:
+def test_every_scene_is_used_once_per_epoch() -> None:
     places = [scene_index(7, place, 5) for place in range(15)]
     assert [sorted(places[epoch : epoch + 5]) for epoch in (0, 5, 10)] == [[0, 1, 2, 3, 4]] * 3
     assert len({tuple(places[epoch : epoch + 5]) for epoch in (0, 5, 10)}) > 1
 
 
-def test_orders_repeat_and_have_views_as_they_should() -> None:
+def test_specs_repeat_and_follow_the_probabilities() -> None:
     specs = [head_spec(3, index, 64, 64, 0.25) for index in range(400)]
     assert specs == [head_spec(3, index, 64, 64, 0.25) for index in range(400)]
     views = Counter(spec.context for spec in specs)
@@ -54,8 +54,8 @@ def test_orders_repeat_and_have_views_as_they_should() -> None:
     assert sum(spec.real for spec in specs) == pytest.approx(100, abs=30)
 
 
-def test_features_are_computed_once_and_give_the_same_gaussians(cache: FeatureCache) -> None:
-    """What comes off the disk predicts what the whole network does, but for bytes and half precision."""
+def test_cached_features_give_the_same_gaussians(cache: FeatureCache) -> None:
+    """Cached features give the same Gaussians as the full network, up to uint8 images and half precision."""
     spec = SampleSpec(11, 2, (1,), 64, 64)
     sample = cache.load(spec)
     views = generate_views(spec)
@@ -72,11 +72,11 @@ def test_features_are_computed_once_and_give_the_same_gaussians(cache: FeatureCa
     again = FeatureCache(cache.folder.parent, cache.model, fail, "test").load(spec)
     assert torch.equal(again.inputs.context, sample.inputs.context)
     other = FeatureCache(cache.folder.parent, new_model(CONFIG, seed=1), fail, "test")
-    with pytest.raises(AssertionError, match="loaded again"):  # features of other weights are others
+    with pytest.raises(AssertionError, match="loaded again"):  # other weights have another cache
         other.load(spec)
 
 
-def test_saturated_opacity_is_reset_and_any_other_left(cache: FeatureCache) -> None:
+def test_only_saturated_opacity_is_reset(cache: FeatureCache) -> None:
     samples = [cache.load(SampleSpec(11, 2, (1,), 64, 64))]
     model = cache.model
     bias = model.gaussians.head2.bias
@@ -135,6 +135,6 @@ def test_run_trains_the_head_alone_and_resumes(finished: Path, tmp_path: Path) -
     assert not (parts / FEATURES).exists()
 
 
-def test_a_head_needs_a_network(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_head_training_needs_a_checkpoint(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert EXIT_STATUS == 2
     assert "give a checkpoint with --init" in refused(capsys, out=tmp_path / "run", part=Part.HEAD)

@@ -1,4 +1,4 @@
-"""Data-parallel training: two processes make the steps that one makes, and neither outlives the other."""
+"""Data-parallel training: the same steps with one and two processes, and no process that outlives the run."""
 
 import json
 import os
@@ -30,27 +30,27 @@ def trained(folder: Path, processes: int) -> tuple[dict[str, torch.Tensor], list
     return torch.load(folder / CHECKPOINT, weights_only=True)["training"]["weights"], entries
 
 
-def test_two_processes_make_the_same_steps(tmp_path: Path) -> None:
-    """The same scenes, shared out: the same gradients but for the order of a sum, and the same figures."""
+def test_two_processes_make_the_same_steps_as_one(tmp_path: Path) -> None:
+    """The same gradients up to the order of summation, and the same metrics."""
     alone, entries = trained(tmp_path / "alone", 1)
     shared, entries_shared = trained(tmp_path / "shared", 2)
     for entry, other in zip(entries, entries_shared, strict=True):
         assert other["loss"] == pytest.approx(entry["loss"], rel=1e-3)
         assert other["gradient"] == pytest.approx(entry["gradient"], rel=1e-2)
-    moved = sum(float((alone[name] - other).abs().sum()) for name, other in shared.items())
+    difference = sum(float((alone[name] - other).abs().sum()) for name, other in shared.items())
     total = sum(float(value.abs().sum()) for value in alone.values())
-    assert moved < 1e-3 * total
-    # The second step starts from weights that the first one changed, so it tells whether all processes stepped alike.
+    assert difference < 1e-3 * total
+    # The second step starts from updated weights, so it shows whether all processes made the same update.
     assert len(entries_shared) == 2
 
 
-def test_a_share_of_a_batch_leaves_no_scene_out() -> None:
-    shares = [list(ProcessGroup(rank, 3).shard(8)) for rank in range(3)]
-    assert shares == [[0, 3, 6], [1, 4, 7], [2, 5]]
+def test_shards_cover_the_batch() -> None:
+    shards = [list(ProcessGroup(rank, 3).shard(8)) for rank in range(3)]
+    assert shards == [[0, 3, 6], [1, 4, 7], [2, 5]]
     assert list(ProcessGroup().shard(3)) == [0, 1, 2] and ProcessGroup().is_main and not ProcessGroup(1, 2).is_main
 
 
-def test_figures_are_averaged_over_the_scenes_that_have_them() -> None:
+def test_metrics_are_averaged_over_the_scenes_that_have_them() -> None:
     assert mean_entries([{"loss": 1.0, "psnr": 20.0}, {"loss": 3.0}]) == {"loss": 2.0, "psnr": 20.0}
 
 
@@ -60,8 +60,8 @@ def test_more_processes_than_scenes_are_refused(tmp_path: Path, capsys: pytest.C
     assert "more than the 1 scenes of a step" in capsys.readouterr().err
 
 
-def test_a_killed_run_leaves_no_process_behind(tmp_path: Path) -> None:
-    """SIGKILL for rank 0: the other notices at its next exchange."""
+def test_killed_run_leaves_no_process_behind(tmp_path: Path) -> None:
+    """SIGKILL for rank 0: the other process ends at its next exchange."""
     options = ["--steps=500", "--size=64", "--batch=2", "--processes=2", "--objective=depth"]
     command = [sys.executable, "-m", "idesplat.tools.training.cli", f"--out={tmp_path}", *options]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
@@ -87,7 +87,7 @@ def _members(group: int) -> bool:
     return True
 
 
-def test_a_process_that_ends_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ended_process_is_a_one_line_error(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise RuntimeError("Connection closed by peer\nmore")
 

@@ -1,4 +1,4 @@
-"""The perceptual distance on photographic features: by hand, and what it says of images."""
+"""The perceptual distance on ImageNet features: by hand, and on images."""
 
 import math
 
@@ -8,7 +8,7 @@ from idesplat.tools.training.perceptual import EfficientNetDistance, squared_dis
 
 
 def test_distance_of_features_by_hand() -> None:
-    """Two pixels: at the first the features stand at 60 degrees, at the second they differ in length alone."""
+    """Two pixels: features at 60 degrees at the first, parallel features of different length at the second."""
     first = torch.tensor([[[[2.0, 3.0]], [[0.0, 4.0]]]])
     angle = math.radians(60)
     second = torch.tensor([[[[5 * math.cos(angle), 0.3]], [[5 * math.sin(angle), 0.4]]]])
@@ -16,7 +16,7 @@ def test_distance_of_features_by_hand() -> None:
     assert float(squared_distance(first, second)) == pytest.approx(expected, rel=1e-5)
 
 
-def test_blur_is_farther_than_a_little_more_light() -> None:
+def test_blur_is_farther_than_a_small_gain() -> None:
     distance = EfficientNetDistance()
     truth = torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(0))
     blurred = torch.nn.functional.avg_pool2d(truth, 5, stride=1, padding=2, count_include_pad=False)

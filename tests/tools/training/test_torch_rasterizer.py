@@ -17,7 +17,7 @@ def reference(case: str) -> dict[str, np.ndarray]:
     return dict(np.load(DATA / f"raster-{case}" / "reference.npz"))
 
 
-def drawn(arrays: dict[str, np.ndarray], gaussians: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+def render_reference(arrays: dict[str, np.ndarray], gaussians: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
     """The reference's view of `gaussians`, in their float type."""
     viewmat, camera, background = (
         torch.from_numpy(arrays[name]).to(gaussians[0].dtype) for name in ("viewmat", "K", "background")
@@ -30,14 +30,14 @@ def drawn(arrays: dict[str, np.ndarray], gaussians: list[Tensor]) -> tuple[Tenso
 def test_matches_gsplat(case: str, dtype: torch.dtype, tolerance: float) -> None:
     """float64 is limited by the reference, which is stored in float32."""
     arrays = reference(case)
-    images = drawn(arrays, [torch.from_numpy(arrays[name]).to(dtype) for name in NAMES])
+    images = render_reference(arrays, [torch.from_numpy(arrays[name]).to(dtype) for name in NAMES])
     for name, ours in zip(("rgb", "alpha", "depth"), images, strict=True):
         assert ours.dtype == dtype
         np.testing.assert_allclose(ours.numpy(), arrays[name], rtol=0, atol=tolerance, err_msg=name)
 
 
 def small_scene(seed: int, degree: int) -> list[Tensor]:
-    """Ten overlapping splats of all sizes before a camera at the origin, float64, that want gradients."""
+    """Ten overlapping splats of all sizes before a camera at the origin, float64, with gradients."""
     rng = np.random.default_rng(seed)
     count = 10
     means = rng.uniform((-1, -1, 1.5), (1, 1, 4), (count, 3))
@@ -66,12 +66,12 @@ def test_gradients_match_finite_differences(seed: int, degree: int) -> None:
 
 
 def test_float32_gradients_match_float64() -> None:
-    """The way back divides by 1 - alpha again and again: thousands of splats must not spoil it."""
+    """The backward pass divides by 1 - alpha for each splat; thousands of divisions must stay accurate."""
     arrays = reference("feedforward")
     gradients = []
     for dtype in (torch.float32, torch.float64):
         gaussians = [torch.from_numpy(arrays[name]).to(dtype).requires_grad_() for name in NAMES]
-        rgb, alpha, depth = drawn(arrays, gaussians)
+        rgb, alpha, depth = render_reference(arrays, gaussians)
         (rgb.square().sum() + alpha.sum() + 0.1 * depth.square().sum()).backward()
         gradients.append([part.grad.double() for part in gaussians])
     for name, ours, exact in zip(NAMES, *gradients, strict=True):
@@ -79,8 +79,8 @@ def test_float32_gradients_match_float64() -> None:
         assert (ours - exact).norm() < 1e-3 * exact.norm(), name
 
 
-def test_opaque_splats_hide_what_lies_behind() -> None:
-    """Behind transmittance 1e-4 nothing adds, and nothing gets a gradient."""
+def test_compositing_ends_at_low_transmittance() -> None:
+    """Splats behind transmittance 1e-4 contribute nothing and get no gradient."""
     count = 6  # alpha 0.99 each: the third would leave 1e-6
     means = torch.zeros(count, 3)
     means[:, 2] = torch.arange(count, 0, -1)  # given back to front
@@ -99,7 +99,7 @@ def test_opaque_splats_hide_what_lies_behind() -> None:
     assert (opacities.grad == 0).all()  # alpha is held at 0.99
 
 
-def test_nothing_to_see_is_background() -> None:
+def test_no_visible_gaussian_gives_the_background() -> None:
     background = torch.tensor([0.1, 0.2, 0.3])
     camera = torch.tensor([[10.0, 0, 4], [0, 10.0, 3], [0, 0, 1]])
     behind = torch.tensor([[0.0, 0, -2]], requires_grad=True)
@@ -113,8 +113,8 @@ def test_nothing_to_see_is_background() -> None:
     assert torch.equal(behind.grad, torch.zeros(1, 3))
 
 
-def real_harmonics(degree: int, direction: np.ndarray) -> list[float]:
-    """3DGS's basis from its definition: real harmonics with the Condon-Shortley phase, order -l to l."""
+def sh_by_definition(degree: int, direction: np.ndarray) -> list[float]:
+    """3DGS's SH basis by definition: real, with the Condon-Shortley phase, orders -l to l."""
     x, y, z = direction
     azimuth = np.arctan2(y, x)
     values = []
@@ -128,13 +128,13 @@ def real_harmonics(degree: int, direction: np.ndarray) -> list[float]:
     return values
 
 
-def test_harmonics_up_to_degree_three_follow_their_definition() -> None:
-    """One splat on the axis of a camera that looks along any direction; each coefficient alone, in its own splat."""
+def test_sh_up_to_degree_three_follow_their_definition() -> None:
+    """One splat on the axis of a camera with random direction, for each coefficient alone."""
     rng = np.random.default_rng(0)
     for _ in range(5):
         direction = rng.normal(0, 1, 3)
         direction /= np.linalg.norm(direction)
-        expected = np.concatenate([real_harmonics(degree, direction) for degree in range(4)])
+        expected = np.concatenate([sh_by_definition(degree, direction) for degree in range(4)])
         right = np.cross(direction, [0.3, 0.5, 0.7])
         right /= np.linalg.norm(right)
         viewmat = torch.eye(4, dtype=torch.float64)

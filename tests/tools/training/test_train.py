@@ -1,4 +1,4 @@
-"""Training: losses by hand, a few steps that learn, runs that are stopped and go on, and what users get wrong."""
+"""Training: losses by hand, a few optimiser steps, resumed runs, and invalid input."""
 
 import json
 import math
@@ -64,7 +64,7 @@ SETTINGS = TrainingSettings(
 
 @pytest.fixture(autouse=True)
 def one_thread() -> Iterator[None]:
-    """One torch thread, as in training, and afterwards the arithmetic that other tests expect."""
+    """One PyTorch thread, as in training; afterwards the settings that other tests expect."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -81,7 +81,7 @@ def test_tiny_preset_is_small_and_complete() -> None:
     assert 256 % config.size_multiple == 0 and config.size_multiple == 32
 
 
-def test_perfect_depth_costs_nothing_and_more_error_more() -> None:
+def test_inverse_depth_loss_grows_with_the_error() -> None:
     truth = torch.rand(2, 1, 8, 8) + 0.1
     bins = torch.full((2, 1, 1, 1), 0.05)
     assert losses.inverse_depth_loss(truth, truth, bins) == 0
@@ -92,8 +92,8 @@ def test_perfect_depth_costs_nothing_and_more_error_more() -> None:
     assert costs[0] == pytest.approx(float(by_hand), rel=0.02)
 
 
-def test_entropy_by_hand() -> None:
-    """Three candidates 0, 1, 2, of which the truth 1.25 shares itself between the last two."""
+def test_cross_entropy_by_hand() -> None:
+    """Candidates 0, 1, 2: the target of truth 1.25 is 0.75 on candidate 1 and 0.25 on candidate 2."""
     probability = torch.tensor([0.2, 0.5, 0.3]).reshape(1, 3, 1, 1)
     candidates = torch.tensor([0.0, 1.0, 2.0]).reshape(1, 3, 1, 1)
     found = losses.candidate_cross_entropy(probability, candidates, torch.full((1, 1, 1, 1), 1.25))
@@ -101,7 +101,7 @@ def test_entropy_by_hand() -> None:
     assert losses.candidate_cross_entropy(probability, candidates, torch.full((1, 1, 1, 1), 2.5)) == 0  # outside
 
 
-def test_gaussians_are_held_to_the_middle_of_their_pixels_alone() -> None:
+def test_offset_prior_by_hand() -> None:
     raw = torch.randn(2, 22, 3, 4)
     raw[:, 1:3] = 0.0
     assert losses.offset_prior(raw) == 0
@@ -109,8 +109,8 @@ def test_gaussians_are_held_to_the_middle_of_their_pixels_alone() -> None:
     assert float(losses.offset_prior(raw)) == pytest.approx(losses.OFFSET_WEIGHT * 0.25 / 2, rel=1e-5)
 
 
-def test_large_errors_of_an_image_do_not_rule() -> None:
-    """Two images, off by 0.1 and by 1 everywhere: their squared errors count as 3e-3 * log(1 + error / 3e-3)."""
+def test_photometric_loss_by_hand() -> None:
+    """Two images with errors of 0.1 and 1 everywhere: r(MSE) = 3e-3 * log(1 + MSE / 3e-3)."""
     truth = torch.zeros(2, 3, 4, 4)
     rendered = truth + torch.tensor([0.1, 1.0])[:, None, None, None]
     expected = 0.003 * (math.log(1 + 0.01 / 0.003) + math.log(1 + 1 / 0.003)) / 2
@@ -119,7 +119,7 @@ def test_large_errors_of_an_image_do_not_rule() -> None:
     assert float(weighted) == pytest.approx(expected + losses.LPIPS_WEIGHT * 0.55, rel=1e-5)
 
 
-def test_an_input_view_is_rendered_beside_the_novel_ones() -> None:
+def test_a_context_view_is_appended_to_the_targets() -> None:
     views = generate_views(SampleSpec(11, 2, (1, 2), 32, 32))
     shown = with_input_view(views, 1)
     assert torch.equal(shown.target_images[:2], views.target_images) and len(shown.target_images) == 3
@@ -128,22 +128,22 @@ def test_an_input_view_is_rendered_beside_the_novel_ones() -> None:
     assert torch.equal(shown.target_intrinsics[2], views.intrinsics[1])
 
 
-def test_monocular_loss_knows_no_scale() -> None:
+def test_monocular_loss_is_scale_invariant() -> None:
     truth = torch.rand(2, 8, 8) + 0.1
     scaled = SimpleNamespace(mono_disparity=0.37 * truth[:, None])
-    turned = SimpleNamespace(mono_disparity=truth.flip(2)[:, None])
+    flipped = SimpleNamespace(mono_disparity=truth.flip(2)[:, None])
     assert float(losses.monocular_loss(scaled, truth)) == pytest.approx(0, abs=1e-6)
-    assert float(losses.monocular_loss(turned, truth)) > 0.01
+    assert float(losses.monocular_loss(flipped, truth)) > 0.01
 
 
-def test_truth_is_picked_where_corners_lie_on_corners() -> None:
+def test_truth_is_resized_with_aligned_corners() -> None:
     truth = torch.arange(64.0).reshape(1, 8, 8)
     assert losses.resize_truth(truth, 2, 2).flatten().tolist() == [0, 7, 56, 63]
     assert torch.equal(losses.resize_truth(truth, 8, 8)[:, 0], truth)
 
 
-def test_new_network_matches_from_the_start() -> None:
-    """The regulariser of a new network says what the correlations say: most where they are largest."""
+def test_new_network_decodes_correlations() -> None:
+    """The U-Net of a new network has its maximum where the correlations have theirs."""
     model = new_model(PRESETS["idesplat-tiny"], seed=0)
     candidates = PRESETS["idesplat-tiny"].dpbus[0].candidates
     peaks = torch.randint(5, candidates - 5, (2, 1, 16, 16))
@@ -185,20 +185,20 @@ def test_curriculum_goes_from_coarse_to_fine_and_lr_decays() -> None:
     assert half == pytest.approx(1000 * (0.74 + (0.05 + (4.39 - 0.05) / 2 - 1.01) / 11), abs=1.5)
 
 
-def test_scenes_come_in_order_and_repeat() -> None:
+def test_prefetched_samples_keep_their_order_and_repeat() -> None:
     specs = [training_spec(5, step, 0, True, 32, 32, three_views=True) for step in range(120)]
     assert specs == [training_spec(5, step, 0, True, 32, 32, three_views=True) for step in range(120)]
     assert len({spec.seed for spec in specs}) == 120 and {spec.context for spec in specs} == {2, 3}
-    drawn = list(prefetch(iter(specs[:7]), generate_views))
-    for spec, views in zip(specs, drawn, strict=False):
+    loaded = list(prefetch(iter(specs[:7]), generate_views))
+    for spec, views in zip(specs, loaded, strict=False):
         assert views.images.shape == (spec.context, 3, 32, 32)
         again = next(prefetch(iter([spec]), generate_views))
         assert torch.equal(views.images, again.images) and torch.equal(views.inverse_depth, again.inverse_depth)
 
 
 @pytest.mark.parametrize("objective", list(Objective))
-def test_a_few_steps_on_one_scene_learn(objective: Objective) -> None:
-    """Depth and novel views each get better where they are asked for."""
+def test_a_few_steps_on_one_scene_reduce_the_loss(objective: Objective) -> None:
+    """Depth and novel views improve where the objective contains them."""
     state = TrainingState(SMALL, seed=0, lr=3e-3, vit_lr=3e-3)
     views = next(prefetch(iter([SampleSpec(11, 2, (1,), 64, 64)]), generate_views))
     phase = training_phases(objective, curriculum=False)[0]
@@ -229,18 +229,18 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_writes_all_that_it_says(finished: Path) -> None:
+def test_run_writes_log_curves_and_predictions(finished: Path) -> None:
     entries = logged(finished)
     assert [entry["step"] for entry in entries] == list(range(1, 9))
     assert all(entry["loss"] > 0 for entry in entries) and "psnr" in entries[-1]
     assert [entry["step"] for entry in entries if "validation_abs_rel" in entry] == [4, 8]
     assert cv2.imread(str(finished / CURVES)).std() > 5
-    pictures = cv2.imread(str(finished / PREDICTIONS))
-    assert pictures.shape == (4 * 64, 6 * 64, 3) and pictures.std() > 5
+    predictions = cv2.imread(str(finished / PREDICTIONS))
+    assert predictions.shape == (4 * 64, 6 * 64, 3) and predictions.std() > 5
 
 
 def test_resumed_run_equals_uninterrupted(finished: Path, tmp_path: Path) -> None:
-    """Stopped after step 5 was logged but not saved: it is done again, and nothing differs from then on."""
+    """Stopped after step 5 was logged but not saved: the resumed run repeats it with equal results."""
 
     def stop(entry: dict[str, float]) -> None:
         if entry["step"] == 5:
@@ -250,7 +250,7 @@ def test_resumed_run_equals_uninterrupted(finished: Path, tmp_path: Path) -> Non
         Trainer(tmp_path, SETTINGS, SMALL).fit(save_every=0, validate_every=4, on_step=stop)
     assert len(logged(tmp_path)) == 5
     with (tmp_path / LOG).open("a") as log:
-        log.write('{"step": 6, "lo')  # a line half written
+        log.write('{"step": 6, "lo')  # an incomplete line
     Trainer(tmp_path, SETTINGS, SMALL).fit(save_every=1e9, validate_every=4)
     assert logged(tmp_path) == logged(finished)
     ours, theirs = (torch.load(folder / CHECKPOINT, weights_only=True) for folder in (tmp_path, finished))
@@ -259,8 +259,8 @@ def test_resumed_run_equals_uninterrupted(finished: Path, tmp_path: Path) -> Non
         assert torch.equal(ours["training"]["weights"][name], theirs["training"]["weights"][name]), name
 
 
-def test_checkpoint_is_one_for_the_exporter(finished: Path) -> None:
-    """The exporter's strict loader reads it, and finds the running mean."""
+def test_checkpoint_holds_the_ema_and_loads_strictly(finished: Path) -> None:
+    """The strict loader of the exporter finds the EMA of the weights."""
     model = load_checkpoint(finished / CHECKPOINT, SMALL)
     content = torch.load(finished / CHECKPOINT, weights_only=True)
     weights = content["training"]["weights"]
@@ -270,7 +270,7 @@ def test_checkpoint_is_one_for_the_exporter(finished: Path) -> None:
     assert any(not torch.equal(found[name], value) for name, value in weights.items())
 
 
-def test_stopped_while_writing_keeps_the_checkpoint_before(
+def test_interrupted_write_keeps_the_previous_checkpoint(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / CHECKPOINT
@@ -290,8 +290,8 @@ def test_stopped_while_writing_keeps_the_checkpoint_before(
 
 
 @pytest.mark.slow
-def test_killed_process_leaves_a_checkpoint_to_go_on_from(tmp_path: Path) -> None:
-    """SIGKILL, wherever it hits, in a run that writes its checkpoint at every step."""
+def test_killed_process_leaves_a_valid_checkpoint(tmp_path: Path) -> None:
+    """SIGKILL at an arbitrary moment of a run that writes its checkpoint at every step."""
     options = {"steps": 500, "size": 64, "batch": 1, "save-every": 0}
     arguments = [f"--{name}={value}" for name, value in options.items()]
     command = [
@@ -316,7 +316,7 @@ def test_killed_process_leaves_a_checkpoint_to_go_on_from(tmp_path: Path) -> Non
     assert 1 <= training["step"] <= len(logged(tmp_path))
 
 
-def test_log_drops_what_is_done_again(tmp_path: Path) -> None:
+def test_log_drops_entries_after_the_checkpoint(tmp_path: Path) -> None:
     log = TrainingLog(tmp_path / LOG, 0)
     for step in (1, 2, 3):
         log.add({"step": step, "loss": 1.0 / step})
@@ -351,7 +351,7 @@ def test_bad_inputs_are_one_line_each(finished: Path, tmp_path: Path, capsys: py
     assert not out.exists() or not list(out.iterdir())
 
 
-def test_photographs_are_trained_on_by_their_views_alone(scene: Path, tmp_path: Path) -> None:
+def test_captures_are_supervised_by_target_views_alone(scene: Path, tmp_path: Path) -> None:
     settings = replace(SETTINGS, objective="photometric", steps=2, data=[str(scene)])
     Trainer(tmp_path, settings, SMALL).fit(save_every=1e9, validate_every=2)
     entries = logged(tmp_path)
@@ -360,28 +360,26 @@ def test_photographs_are_trained_on_by_their_views_alone(scene: Path, tmp_path: 
     assert cv2.imread(str(tmp_path / PREDICTIONS)).shape == (4 * 64, 4 * 64, 3)
 
 
-def test_folder_samples_follow_their_spec(scene: Path) -> None:
+def test_capture_samples_follow_their_spec(scene: Path) -> None:
     scenes = CaptureScenes([scene], near=1, far=20)
     spec = SampleSpec(5, 2, (1,), 64, 96)
     first, again = scenes.load(spec), scenes.load(spec)
     assert torch.equal(first.images, again.images) and torch.equal(first.target_images, again.target_images)
     assert first.images.shape == (2, 3, 64, 96) and first.target_images.shape == (1, 3, 64, 96)
-    places = torch.cat([first.extrinsics, first.target_extrinsics])[:, :3, 3]
-    assert len(places.unique(dim=0)) == 3
+    centres = torch.cat([first.extrinsics, first.target_extrinsics])[:, :3, 3]
+    assert len(centres.unique(dim=0)) == 3
     zoomed = scenes.load(replace(spec, target_zooms=(2,)))
-    corner = (2 * first.target_intrinsics[0, :2, 2] - zoomed.target_intrinsics[0, :2, 2]).numpy()  # in windows
+    corner = (2 * first.target_intrinsics[0, :2, 2] - zoomed.target_intrinsics[0, :2, 2]).numpy()  # in crop sizes
     left, top = (corner * (96, 64)).round().astype(int)
     shown = first.target_images[0].repeat_interleave(2, 1).repeat_interleave(2, 2)
     shown = shown[:, top : top + 64, left : left + 96]
     assert torch.equal(first.images, zoomed.images) and (left > 0 or top > 0)
     assert (zoomed.target_images[0] - shown).abs().mean() < 0.05
-    assert len(scenes.load(SampleSpec(5, 4, (1, 2), 64, 96)).images) == 2  # of the 4 photographs that are not held out
+    assert len(scenes.load(SampleSpec(5, 4, (1, 2), 64, 96)).images) == 2  # 4 images are not held out
 
 
-def test_validation_renders_photographs_that_training_never_uses(
-    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of five photographs, the first one is held out."""
+def test_validation_renders_held_out_images(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of five images, the first is held out."""
     used: dict[str, set[str]] = {"train": set(), "validate": set()}
     now = "train"
     opened = captures.load_view
@@ -407,19 +405,19 @@ def test_validation_renders_photographs_that_training_never_uses(
     assert used == {"train": {"001.png", "002.png", "003.png", "004.png"}, "validate": {"000.png"}}
 
 
-def test_folder_with_too_few_photographs_is_refused(tmp_path: Path) -> None:
+def test_folder_with_too_few_images_is_refused(tmp_path: Path) -> None:
     make_scene(tmp_path, seed=2, views=4, height=32, width=48)
     with pytest.raises(InputError, match="3 images to train on and 1 held out for validation, expected at least"):
         CaptureScenes([tmp_path], near=1, far=20)
 
 
-def test_folder_without_a_photograph_is_refused(scene: Path, tmp_path: Path) -> None:
+def test_missing_image_is_refused(scene: Path, tmp_path: Path) -> None:
     shutil.copy(scene / "transforms.json", tmp_path)
     with pytest.raises(InputError, match="which is not there"):
         CaptureScenes([tmp_path], near=1, far=20)
 
 
-def test_init_takes_weights_and_starts_from_step_zero(finished: Path) -> None:
+def test_init_loads_weights_and_starts_at_step_zero(finished: Path) -> None:
     state = TrainingState(SMALL, seed=1, lr=1e-3, vit_lr=1e-3)
     state.start_from(finished / CHECKPOINT)
     expected = load_checkpoint(finished / CHECKPOINT, SMALL).state_dict()
