@@ -7,7 +7,8 @@ import warnings
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from .runtime import startup as startup
+# Absolute: pytest also imports this file by itself, without a package, where the checkout's folder is called `a-b`.
+from idesplat.runtime import startup as startup
 
 if TYPE_CHECKING:
     from .export.pipeline import export_checkpoint

@@ -17,9 +17,20 @@ ROOT = Path(__file__).parents[2]
 DOCUMENTS = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
 # Sections about names that no longer exist.
 HISTORY = {"CHANGELOG.md"}
+# Files that the pages about tasks tell the reader to write, and a file of another project.
+TO_BE_WRITTEN = {
+    "runtime/cameras/formats/middlebury.py",
+    "tests/runtime/cameras/test_middlebury.py",
+    "model/mono/__init__.py",
+    "model/mono/family.py",
+    "tests/model/test_mono.py",
+    "tests/runtime/views/test_selection_distance.py",
+    "docs/nerfology/methods/splat.md",
+}
+TO_BE_WRITTEN_MODULES = {"idesplat.model.mono"}
 OLD_COMMANDS = ("idesplat-infer", "idesplat-export")  # other names of sub-commands
 CODE = re.compile(r"```[^\n]*\n(.*?)```|`([^`\n]+)`", re.DOTALL)
-INDENTED = re.compile(r"^    (\S.*(?:\\\n.*)*)", re.MULTILINE)
+INDENTED = re.compile(r"^    (\S(?:.*\\\n)*.*)", re.MULTILINE)
 MODULE = re.compile(r"\bidesplat(?:\.[A-Za-z_]\w*)+")
 PLACES = r"(?:runtime|model|export|tools|tests|docs)"
 REPOSITORY_PATH = re.compile(rf"^{PLACES}/[\w./-]+$")
@@ -82,7 +93,7 @@ def test_a_wrong_command_and_a_wrong_option_are_found(tmp_path: Path) -> None:
 @pytest.mark.parametrize("document", [d for d in DOCUMENTS if d.name not in HISTORY], ids=name_of)
 def test_modules_and_functions_exist(document: Path) -> None:
     for dotted in set(MODULE.findall(document.read_text(encoding="utf-8"))):
-        if not dotted.endswith((".ckpt", ".onnx", ".json")):
+        if dotted not in TO_BE_WRITTEN_MODULES and not dotted.endswith((".ckpt", ".onnx", ".json")):
             resolve(dotted)
 
 
@@ -105,14 +116,13 @@ def test_a_wrong_name_is_found() -> None:
         resolve("idesplat.runtime.no_such_module")
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=name_of)
+@pytest.mark.parametrize("document", [d for d in DOCUMENTS if d.name not in HISTORY], ids=name_of)
 def test_paths_exist(document: Path) -> None:
     for snippet in snippets(document):
         for word in snippet.split():
             path = word.strip("`(),;:").rstrip(".")
-            if document.name in HISTORY or not REPOSITORY_PATH.match(path):
-                continue
-            assert (ROOT / path).exists(), path
+            if REPOSITORY_PATH.match(path) and path not in TO_BE_WRITTEN:
+                assert (ROOT / path).exists(), path
 
 
 @pytest.mark.parametrize("document", [d for d in DOCUMENTS if d.parent == ROOT], ids=name_of)
