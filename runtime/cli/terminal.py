@@ -28,6 +28,7 @@ from ..errors import (
 from .progress_bar import draw_progress
 
 STDERR = 2
+SYSTEM_REMEDY = "give files and a standard output that can be read and written, on disks with room"
 HELP_OPTIONS = {"help_option_names": ["-h", "--help"]}  # typer's settings of a context
 # Besides SIGINT. Windows has no SIGHUP.
 ENDING_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
@@ -108,7 +109,8 @@ def _status(app: typer.Typer) -> int:
     except OSError as error:
         if error.strerror is None:  # not the system's
             raise
-        status = _fail(f"{error.filename}: {error.strerror}" if error.filename else error.strerror)
+        where = f"{error.filename}: " if error.filename else ""
+        status = _fail(f"{where}{error.strerror}; {SYSTEM_REMEDY}")
     except Exception as error:
         if not hasattr(error, "format_message"):  # only what is wrong with the arguments has a message of this kind
             raise

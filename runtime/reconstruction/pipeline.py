@@ -1,5 +1,6 @@
 """Images to Gaussians in one function: what `idesplat infer` does, as a library."""
 
+import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -19,6 +20,8 @@ from ..splats.filtering import FilterOptions, describe_removed, filter_gaussians
 from ..system.progress import CALLBACK, ProgressCallback, reporting_to, working
 from ..views.world_offset import apply_offset, parse_offset
 from .result import Reconstruction
+
+LOG = logging.getLogger(__name__)
 
 Images = Path | str | Sequence[Path | str | np.ndarray]
 
@@ -67,18 +70,21 @@ def reconstruct(
         given = [images] if isinstance(images, (str, Path)) else list(images)
         form = CameraFormat(camera_format) if camera_format else None
         inputs = read_inputs(Request(given, cameras, form, focal, select, views, size), files)
+        LOG.info("views %s, cameras %s", ", ".join(inputs.views.names), inputs.source)
         if on_inputs is not None:
             on_inputs(inputs)
         prepared = time.perf_counter()
         with working("loading the model"):
             predictor = Predictor(files, provider)
         loaded = time.perf_counter()
+        LOG.info("loaded %s on %s in %.2f s", files.path, provider, predictor.load_seconds)
         with working("finding near and far"):
             span = predictor.depth_range(inputs.views, near, far)
         placed, notes = apply_offset(inputs.views, offset, span.near)
         seconds = {"load": predictor.load_seconds, "prepare": prepared - started + time.perf_counter() - loaded}
         with working("predicting depth and Gaussians"):
             prediction = predictor.predict_views(placed, span.near, span.far)
+        LOG.info("predicted in %s", ", ".join(f"{name} {value:.2f} s" for name, value in prediction.seconds.items()))
         removed: dict[str, int] = {}
         if filters.enabled:
             whole = prediction.need_gaussians()

@@ -1,5 +1,6 @@
 """Files: read only where they are regular ones, written so that they appear whole or not at all."""
 
+import logging
 import os
 import re
 import shutil
@@ -45,6 +46,8 @@ class WriteGuard(Protocol):
         """Take note of a file that has just been written."""
 
 
+LOG = logging.getLogger(__name__)
+
 GUARD: ContextVar[WriteGuard | None] = ContextVar("GUARD", default=None)
 
 
@@ -63,6 +66,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
             temporary = folder / path.name
             yield temporary
             temporary.replace(path)
+        LOG.debug("wrote %s", path)
         if guard is not None:
             guard.written(path)
     except OSError as error:

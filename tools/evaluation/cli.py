@@ -45,7 +45,7 @@ def scene(
     hold_out_every: Annotated[
         int, typer.Option(help="Hold out images 0, N, 2 N and on, without --target.", min=2)
     ] = HOLD_OUT_EVERY,
-    depth: Annotated[Path | None, typer.Option(help="Folder of true depth, as make_scene writes it.")] = None,
+    true_depth: Annotated[Path | None, typer.Option(help="Folder of true depth, as make_scene writes it.")] = None,
     size: Size = None,
     near: Near = None,
     far: Far = None,
@@ -73,7 +73,7 @@ def scene(
         targets=target or [],
         views=views,
         hold_out_every=hold_out_every,
-        depth=depth,
+        depth=true_depth,
         size=parse_size(size) if size else None,
         near=near,
         far=far,

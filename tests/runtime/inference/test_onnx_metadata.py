@@ -6,7 +6,7 @@ import onnx
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from idesplat.runtime import InputError
+from idesplat import InputError
 from idesplat.runtime.inference import predictor as predictor_module
 from idesplat.runtime.inference.metadata import METADATA_KEY
 from idesplat.runtime.inference.model_files import read_model

@@ -66,7 +66,7 @@ def rendered_from(gaussians: Gaussians, pose: np.ndarray, K: np.ndarray, near: f
 
 
 def test_scene_gives_the_metrics_of_the_library(workplace: Path, opened: Predictor, capsys: Capture) -> None:
-    assert run_command(main, *SCENE, *NAMED, "--near", "1", "--far", "20", "--depth", "depth") == 0
+    assert run_command(main, *SCENE, *NAMED, "--near", "1", "--far", "20", "--true-depth", "depth") == 0
     cameras = read_cameras("transforms.json")
     context = [cameras[0], cameras[4]]
     prediction = opened.predict([Path(camera.name) for camera in context], context, near=1, far=20)
@@ -227,7 +227,7 @@ BAD = {
     "near of zero": (nothing, (*SCENE, "--near", "0"), "expected 0 < near < far"),
     "near of nothing": (nothing, (*CHUNKS, "--near", "nan"), "expected 0 < near < far"),
     "near behind the model's far": (nothing, (*CHUNKS, "--near", "200"), "near 200 and far 100"),
-    "no depth": (nothing, (*SCENE, "--depth", "images"), "no readable depth"),
+    "no depth": (nothing, (*SCENE, "--true-depth", "images"), "no readable depth"),
     "an output folder that nobody may write to": (nothing, (*SCENE, "--out", "/proc"), "cannot write into /proc"),
     "an output folder that is a file": (nothing, (*SCENE, "--out", "transforms.json"), "transforms.json"),
     "no chunks": (nothing, ("chunks", "images", *CHUNKS[2:]), "no .torch chunks"),
