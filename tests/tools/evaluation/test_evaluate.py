@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 import torch
 from conftest import run_command
-from idesplat import Gaussians, Predictor, rasterize, read_cameras
+from idesplat import Gaussians, InputError, Predictor, evaluate, rasterize, read_cameras
 from idesplat.runtime.cli.outputs import Outputs
 from idesplat.runtime.images.io import find_images, load_image
 from idesplat.runtime.images.resizing import resize_and_crop
 from idesplat.runtime.system.files import atomic_write
+from idesplat.runtime.system.progress import Progress, reporting_to
 from idesplat.runtime.views.batch import match_images_to_cameras
-from idesplat.tools.evaluation import defaults
+from idesplat.tools.evaluation import defaults, metrics
 from idesplat.tools.evaluation import evaluate as library
 from idesplat.tools.evaluation.cases import synthetic_case
 from idesplat.tools.evaluation.chunks import IndexEntry, chunk_cases
@@ -112,6 +113,28 @@ def test_scene_gives_the_metrics_of_the_library(workplace: Path, opened: Predict
         "2 views held out, 64x96",
     ):
         assert text in printed
+
+
+def test_the_library_gives_the_same_prints_nothing_and_reports_progress(
+    workplace: Path, opened: Predictor, capfd: Capture
+) -> None:
+    assert run_command(main, *SCENE, *NAMED, "--depth", "depth") == 0
+    capfd.readouterr()
+    reports: list[Progress] = []
+    with reporting_to(reports.append):
+        names = {"context": ["000", "004"], "targets": ["001", "002"]}
+        found = evaluate("images", "transforms.json", opened, **names, depth=Path("depth"))
+    assert capfd.readouterr() == ("", "")
+    assert found.mean == results()["mean"] and found.size == (64, 96)
+    (only,) = found.scenes
+    assert [target.name for target in only.targets] == ["001.png", "002.png"]
+    assert (reports[0].done, reports[-1].done, reports[-1].total, reports[-1].ended) == (0, 1, 1, True)
+
+
+def test_missing_scikit_image_is_reported_before_inference(workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metrics, "find_spec", lambda package: None)
+    with pytest.raises(InputError, match="scikit-image is needed"):
+        evaluate("images", "transforms.json", "model.onnx")
 
 
 def test_scene_without_names_prints_its_split(workplace: Path, capsys: Capture) -> None:
