@@ -6,17 +6,20 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ....runtime.errors import InputError
+from ....runtime.system.cache_folder import cache_folder
 from ....runtime.system.files import make_folder, scratch_folder
 
-CLONES = "captures"  # in our own cache folder
+CLONES = "captures"  # in idesplat's cache folder
 HOST = "https://github.com"
 GIT_FOLDER = ".git"
 
 
 def clones_folder() -> Path:
-    """The default folder for clones: captures in idesplat's folder of the user's cache."""
-    given = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
-    return (Path(given) if given else Path.home() / ".cache") / "idesplat" / CLONES
+    """The default folder for clones, in idesplat's cache folder; raises InputError if the user has no home folder."""
+    try:
+        return cache_folder(CLONES)
+    except RuntimeError as error:
+        raise InputError(f"no folder for clones ({error}); give --checkouts") from None
 
 
 def find_checkout(folder: Path, repository: str) -> Path | None:
