@@ -1,12 +1,12 @@
-"""What depth maps say about themselves and about each other."""
+"""Depth discontinuities within depth maps, and consistency between those of several views."""
 
 import numpy as np
 
-DEPTH_TOLERANCE = 0.05  # share of the depth by which two views may differ about a surface and still mean the same one
+DEPTH_TOLERANCE = 0.05  # relative difference in depth up to which two views agree
 
 
 def depth_jumps(depth: np.ndarray) -> np.ndarray:
-    """By how much depth [views, height, width] differs among a pixel and its eight neighbours, as a share of it."""
+    """Relative depth range, max / min - 1, in each 3 x 3 window of depth [views, height, width]; of the same shape."""
     import cv2
 
     square = np.ones((3, 3), np.uint8)
@@ -16,17 +16,19 @@ def depth_jumps(depth: np.ndarray) -> np.ndarray:
 def multi_view_consistency(
     points: np.ndarray, depth: np.ndarray, extrinsics: np.ndarray, intrinsics: np.ndarray
 ) -> np.ndarray:
-    """The share of the other views that confirm each point, float32 [views, height, width].
+    """The fraction of the other views that agree with each point, float32 [views, height, width].
 
-    points: where the pixels are in the world, [views, height, width, 3]. depth: z-depth, [views, height, width].
-    A view confirms a point that lies within 5 % of the depth that it sees there, and denies one that it sees through.
-    A view does not judge points outside its picture or behind its surface; a point that none judges gets 1.
-    Of two views that contradict each other neither is known to be right; only more views can tell.
+    points: world positions of the pixels, [views, height, width, 3]. depth: z-depth, [views, height, width].
+    extrinsics: camera-to-world, [views, 4, 4]. intrinsics: normalised, [views, 3, 3].
+    A view agrees with a point within 5 % of its own depth there, and disagrees with a point in front of that. It
+    abstains on points outside its image, and on points behind its surface, which are occluded. Without votes a point
+    gets 1.
+    With two views, a disagreement does not tell which of both is wrong.
     """
     import cv2
 
-    square = np.ones((3, 3), np.uint8)  # a point falls between pixels, so a view says what its neighbours say, too
-    confirmed, denied = np.zeros(depth.shape, np.float32), np.zeros(depth.shape, np.float32)
+    square = np.ones((3, 3), np.uint8)  # points project between pixels, so their neighbours count as well
+    agree, disagree = np.zeros(depth.shape, np.float32), np.zeros(depth.shape, np.float32)
     for other, surface in enumerate(depth):
         nearest, farthest = cv2.erode(surface, square), cv2.dilate(surface, square)
         for view in range(len(depth)):
@@ -35,16 +37,19 @@ def multi_view_consistency(
             pixel, z, seen = project_to_view(points[view], surface.shape, extrinsics[other], intrinsics[other])
             behind_nearest = z >= nearest.ravel()[pixel] * (1 - DEPTH_TOLERANCE)
             before_farthest = z <= farthest.ravel()[pixel] * (1 + DEPTH_TOLERANCE)
-            confirmed[view] += seen & behind_nearest & before_farthest
-            denied[view] += seen & ~behind_nearest
-    judged = confirmed + denied
-    return np.where(judged > 0, confirmed / np.maximum(judged, 1), 1).astype(np.float32)
+            agree[view] += seen & behind_nearest & before_farthest
+            disagree[view] += seen & ~behind_nearest
+    votes = agree + disagree
+    return np.where(votes > 0, agree / np.maximum(votes, 1), 1).astype(np.float32)
 
 
 def project_to_view(
     points: np.ndarray, shape: tuple[int, ...], extrinsics: np.ndarray, intrinsics: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixel (row * width + column), z-depth and whether it is in the picture, for points [..., 3], in one view."""
+    """Projection of points [..., 3] into one view: pixel index (row * width + column), z-depth, is it in the image.
+
+    shape: height and width. Pixel indices of points outside the image are 0.
+    """
     height, width = shape
     local = (points - extrinsics[:3, 3]) @ extrinsics[:3, :3]  # [..., 3]
     z = local[..., 2]

@@ -1,17 +1,18 @@
-"""Rigid transforms: checks and the inverse."""
+"""Rigid transforms [R t; 0 1]: checks and the inverse."""
 
 import numpy as np
 
 from ..errors import InputError
 
-RIGID_TOLERANCE = 1e-3  # how far a rotation's singular values may be from 1
-RIGID_ROUNDING = 1e-12  # below this a rotation is left as it is, so that what we write is read back unchanged
+RIGID_TOLERANCE = 1e-3  # of the singular values of a rotation, which are 1
+RIGID_ROUNDING = 1e-12  # rotations this close are not changed, so that files are read back exactly
+MAX_COORDINATE = 1e9  # larger coordinates are taken for errors; float32 has no precision left for a scene there
 
 
 def check_rigid(pose: np.ndarray) -> np.ndarray:
-    """Return the pose [4, 4] as float64 with an orthonormal rotation.
+    """The pose [4, 4] as float64, its rotation replaced by the nearest orthonormal one (by SVD).
 
-    Raises InputError if it is not finite, or scaled, sheared or mirrored by more than rounding (1e-3).
+    Raises InputError if it is not finite, or scaled, sheared or mirrored beyond a tolerance of 1e-3.
     """
     pose = np.asarray(pose, dtype=np.float64)
     if pose.shape != (4, 4):
@@ -30,7 +31,9 @@ def check_rigid(pose: np.ndarray) -> np.ndarray:
         kind = "cannot be inverted" if singular[2] < RIGID_TOLERANCE else "is scaled or sheared"
         raise InputError(f"the pose's rotation {kind}: singular values {scales}, expected 1, 1, 1")
     if np.linalg.det(u @ vt) < 0:
-        raise InputError("the pose's rotation is mirrored: determinant -1, expected 1; check the axes' convention")
+        raise InputError(
+            "the pose's rotation is mirrored: determinant -1, expected 1; check the convention of the axes"
+        )
     if error > RIGID_ROUNDING:
         pose = pose.copy()
         pose[:3, :3] = u @ vt
@@ -38,12 +41,9 @@ def check_rigid(pose: np.ndarray) -> np.ndarray:
 
 
 def invert_rigid(transform: np.ndarray) -> np.ndarray:
-    """The inverse of a rigid transform [4, 4]. Raises InputError as `check_rigid`."""
+    """The inverse [R^T, -R^T t; 0, 1] of a rigid transform [4, 4], float64. Raises InputError as `check_rigid`."""
     transform = check_rigid(transform)
     inverse = np.eye(4)
     inverse[:3, :3] = transform[:3, :3].T
     inverse[:3, 3] = -transform[:3, :3].T @ transform[:3, 3]
     return inverse
-
-
-MAX_COORDINATE = 1e9  # a coordinate beyond this is a mistake, and float32 could not place a scene around it

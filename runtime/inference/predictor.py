@@ -9,6 +9,7 @@ import numpy as np
 
 from ..cameras.camera import Camera
 from ..errors import InputError, error_context
+from ..geometry.intrinsics import denormalize_intrinsics
 from ..images.arrays import as_uint8_image
 from ..splats.gaussians import Gaussians
 from ..views.batch import ViewBatch, build_view_batch, check_view_arrays
@@ -166,7 +167,7 @@ class Predictor:
             "near": (nearest * frame.scale).astype(np.float32),
             "far": (farthest * frame.scale).astype(np.float32),
         }
-        Ks = np.array([[width], [height], [1]]) * intrinsics.astype(np.float64)  # [views, 3, 3]
+        Ks = denormalize_intrinsics(intrinsics, width, height)  # [views, 3, 3]
         ranges = zip(nearest.tolist(), farthest.tolist(), strict=True)
         cameras = [
             Camera(name, width, height, K, pose, depth_range=span)

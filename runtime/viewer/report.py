@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from ..geometry.consistency import multi_view_consistency
+from ..geometry.intrinsics import denormalize_intrinsics
 from ..images.colormaps import colormap_depth, inverse_depth_range, to_uint8
 from ..rendering.render import render_view
 from ..splats.gaussians import Gaussians
@@ -89,7 +90,7 @@ def _sections(depth: np.ndarray, gaussians: Gaussians, views: ViewBatch, ends: t
     height, width = depth.shape[1:]
     points = points_from_depth(depth, views.images, views.extrinsics, views.intrinsics).positions
     confirmed = multi_view_consistency(points.reshape(*depth.shape, 3), depth, views.extrinsics, views.intrinsics)
-    Ks = views.intrinsics.astype(np.float64) * np.array([width, height, 1.0])[:, None]  # [views, 3, 3]
+    Ks = denormalize_intrinsics(views.intrinsics, width, height)  # [views, 3, 3]
     for index in progress(range(len(depth)), "drawing the report"):
         photograph = to_uint8(views.images[index].transpose(1, 2, 0))
         drawn = to_uint8(render_view(gaussians, views.extrinsics[index], Ks[index], width, height).rgb)

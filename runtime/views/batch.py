@@ -10,11 +10,12 @@ import numpy as np
 
 from ..cameras.camera import Camera
 from ..errors import InputError, error_context
+from ..geometry.baselines import nearest_neighbor_pairs, pairwise_baselines
 from ..geometry.intrinsics import check_intrinsics
 from ..geometry.rigid import check_rigid
 from ..images.header import DamagedImage
 from ..images.io import image_stem
-from .depth_range import nearest_neighbor_pairs, scene_depths
+from .depth_range import scene_depths
 from .loader import FeatureImage, ImageCameraPair, ViewLoader
 from .selection import MIN_VIEWS, score_pairs, select_views
 
@@ -216,15 +217,9 @@ def _examples(names: Sequence[object]) -> str:
 # ---- poses
 
 
-def _baselines(extrinsics: np.ndarray) -> np.ndarray:
-    """Distances between cameras, [cameras, cameras]."""
-    positions = extrinsics[:, :3, 3]
-    return np.linalg.norm(positions[:, None] - positions[None], axis=-1)
-
-
 def _check_distinct(extrinsics: np.ndarray, names: Sequence[str]) -> None:
     """Refuse cameras without any baseline, and two cameras at one pose."""
-    baselines = _baselines(extrinsics)
+    baselines = pairwise_baselines(extrinsics)
     rounding = ROUNDINGS * float(np.finfo(extrinsics.dtype).eps * np.abs(extrinsics[:, :3, 3]).max())
     if baselines.max() <= rounding:
         raise InputError(

@@ -7,7 +7,9 @@ import numpy as np
 
 from ..cameras.camera import Camera
 from ..errors import InputError
+from ..geometry.baselines import nearest_neighbor_pairs
 from ..geometry.depth_bounds import MIN_POINTS, depth_bounds
+from ..geometry.intrinsics import denormalize_intrinsics
 from ..geometry.rigid import invert_rigid
 from ..sfm.features import (
     Features,
@@ -96,7 +98,7 @@ def _matched(
         height, width = images.shape[2:]
         pictures = np.rint(np.clip(images, 0, 1) * 255).astype(np.uint8).transpose(0, 2, 3, 1)
         features = [extract_features(np.ascontiguousarray(picture)) for picture in pictures]
-        K = np.array([[width], [height], [1]]) * intrinsics.astype(np.float64)  # [views, 3, 3]
+        K = denormalize_intrinsics(intrinsics, width, height)  # [views, 3, 3]
     depths = [np.zeros(0)]
     for i, j in nearest_neighbor_pairs(extrinsics):
         depths += triangulated_depths(features[i], features[j], K[i], K[j], invert_rigid(extrinsics[j]) @ extrinsics[i])
@@ -133,14 +135,6 @@ def triangulated_depths(
     angle = parallax_angles(points, invert_rigid(second_from_first)[:3, 3])
     seen = (points[:, 2] > 0) & (there[:, 2] > 0) & (angle > SMALLEST_PARALLAX_DEG)
     return points[seen, 2], there[seen, 2]
-
-
-def nearest_neighbor_pairs(extrinsics: np.ndarray) -> list[tuple[int, int]]:
-    """Each view with the one nearest to it, pairs of indices, each pair once."""
-    positions = extrinsics[:, :3, 3]
-    distances = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
-    np.fill_diagonal(distances, np.inf)
-    return sorted({(min(i, j), max(i, j)) for i, j in enumerate(distances.argmin(axis=1).tolist())})
 
 
 def _from_baseline(extrinsics: np.ndarray, trained: tuple[float, float]) -> DepthRange:

@@ -7,6 +7,7 @@ import numpy as np
 
 from ..cameras.camera import Camera
 from ..errors import InputError
+from ..geometry.baselines import longest_baseline
 
 MIN_VIEWS = 2
 
@@ -24,7 +25,6 @@ UNKNOWN_DISTANCE = 3.0
 # Up to so many cameras every pair is scored; of more, those pairs that promise to be good.
 EXHAUSTIVE = 512
 PAIRS_AT_ONCE = 1024  # that are scored together, in some 10 MB
-BASELINES_AT_ONCE = 64  # cameras whose distances from all others are computed together
 # Where a good partner of a camera would stand, in baselines of GOOD_PARALLAX_DEG: to all sides, ahead and behind.
 SIDES = 8
 AHEAD = (2.0, 6.0)
@@ -215,18 +215,9 @@ def _common_distance(cameras: Sequence[Camera]) -> float:
     joint, movement, turning = (positions * forward).sum(), (positions**2).sum(), (forward**2).sum()
     if joint < 0 and joint**2 > FOCUS_EXPLAINS * movement * turning:
         return float(-joint / turning)
-    return UNKNOWN_DISTANCE * _longest_baseline(positions)
+    return UNKNOWN_DISTANCE * longest_baseline(positions)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
     """Vectors [3, ...] scaled to a length of 1."""
     return vectors / np.sqrt(np.maximum((vectors**2).sum(axis=0), np.finfo(float).tiny))
-
-
-def _longest_baseline(positions: np.ndarray) -> float:
-    """The largest distance between two of the positions [cameras, 3]."""
-    longest = 0.0
-    for start in range(0, len(positions), BASELINES_AT_ONCE):
-        apart = positions[start : start + BASELINES_AT_ONCE, None] - positions[None]
-        longest = max(longest, float(np.einsum("ijk,ijk->ij", apart, apart).max()))
-    return float(np.sqrt(longest))

@@ -10,6 +10,7 @@ from math import ceil
 
 import numpy as np
 
+from ...runtime.geometry.rigid import invert_rigid
 from ...runtime.geometry.sh import SH_0
 from ...runtime.splats.gaussians import Gaussians
 from ...runtime.splats.points import unproject
@@ -84,7 +85,7 @@ def warp_plane(
     weights = 1 / np.maximum(_distances(context, extrinsics), TINY)
     mixed, total = np.zeros((height, width, 3), np.float32), np.zeros((height, width, 1), np.float32)
     for view, weight in enumerate(weights / weights.sum()):
-        there = np.linalg.inv(context.extrinsics[view].astype(np.float64)) @ extrinsics
+        there = invert_rigid(context.extrinsics[view]) @ extrinsics
         # Homography of the plane n^T X = depth: R + t n^T / depth, between normalised image coordinates.
         homography = there[:3, :3] + inverse_depth * there[:3, 3:] * np.array([[0, 0, 1.0]])
         image, seen = _warped(context, view, context.K(view) @ homography @ np.linalg.inv(K) @ spread, (height, width))

@@ -19,6 +19,7 @@ import typer
 from ...runtime.cli.options import Overwrite
 from ...runtime.cli.outputs import command, outputs
 from ...runtime.cli.terminal import run, say
+from ...runtime.geometry.intrinsics import denormalize_intrinsics
 from ...runtime.system.files import atomic_write
 
 if TYPE_CHECKING:  # for a fast start: the ray caster is loaded when it is needed
@@ -114,7 +115,7 @@ def _arc(middle: np.ndarray, distance: float, views: int) -> np.ndarray:
 
 def _transforms(poses: np.ndarray, intrinsics: np.ndarray, width: int, height: int) -> dict[str, Any]:
     """The content of transforms.json: intrinsics in pixels, camera-to-world with OpenGL axes."""
-    (fl_x, _, cx), (_, fl_y, cy) = (intrinsics[:2] * [[width], [height]]).tolist()
+    (fl_x, _, cx), (_, fl_y, cy) = denormalize_intrinsics(intrinsics, width, height)[:2].tolist()
     frames = [
         {"file_path": f"images/{index:03}.png", "transform_matrix": (pose @ OPENGL_AXES).tolist()}
         for index, pose in enumerate(poses)

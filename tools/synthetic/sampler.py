@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from ...runtime.geometry.intrinsics import crop_intrinsics, denormalize_intrinsics, scale_intrinsics
+from ...runtime.geometry.rigid import invert_rigid
 from .layout import Layout, generate_layout
 from .raycast import Scene, cast_rays
 from .textures import Textures, texture_bank
@@ -92,7 +94,7 @@ def generate_sample(
     extrinsics = _sample_poses(rng, layout, intrinsics, context, targets)
     for view, zoom in enumerate(target_zooms, start=context):
         if zoom > 1:
-            intrinsics[view] = crop_intrinsics(intrinsics[view], zoom, rng.uniform(0, zoom - 1, 2))
+            intrinsics[view] = zoom_intrinsics(intrinsics[view], zoom, rng.uniform(0, zoom - 1, 2))
     views = [
         render(layout.scene, textures, pose, k, height, width, samples)
         for pose, k in zip(extrinsics, intrinsics, strict=True)
@@ -126,7 +128,7 @@ def render(
     black). Depth is that at the pixel's centre.
     """
     image, depth = np.zeros((height, width, 3), np.float32), np.empty((height, width), np.float32)
-    (fx, _, cx), (_, fy, cy) = intrinsics[:2] * [[width], [height]]
+    (fx, _, cx), (_, fy, cy) = denormalize_intrinsics(intrinsics, width, height)[:2]
     cast_rays(scene, textures.texels, pose, (fx, fy, cx, cy), _pixel_offsets(samples), image, depth)
     return image, depth
 
@@ -144,12 +146,12 @@ def look_at(eye: np.ndarray, focus: np.ndarray, roll: float = 0.0) -> np.ndarray
     return pose
 
 
-def crop_intrinsics(intrinsics: np.ndarray, zoom: int, corner: np.ndarray) -> np.ndarray:
+def zoom_intrinsics(intrinsics: np.ndarray, zoom: int, corner: np.ndarray) -> np.ndarray:
     """Normalised intrinsics [3, 3] of a crop of an image that is rendered `zoom` times as large.
 
     corner: the crop's upper left corner [2], in units of the crop's size.
     """
-    return np.diag([zoom, zoom, 1.0]) @ intrinsics - np.array([[0, 0, corner[0]], [0, 0, corner[1]], [0, 0, 0]])
+    return crop_intrinsics(scale_intrinsics(intrinsics, zoom, zoom), *corner)
 
 
 def probe(scene: Scene, pose: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
@@ -239,7 +241,7 @@ def _overlap(scene: Scene, poses: np.ndarray, intrinsics: np.ndarray, seen: np.n
     centres = (np.arange(PROBE) + 0.5) / PROBE
     pixels = np.stack([*np.meshgrid(centres, centres), np.ones((PROBE, PROBE))], axis=-1)
     points = pixels @ np.linalg.inv(intrinsics[0]).T * seen[..., None]
-    relative = np.linalg.inv(poses[view]) @ poses[0]
+    relative = invert_rigid(poses[view]) @ poses[0]
     projected = (points @ relative[:3, :3].T + relative[:3, 3]) @ intrinsics[view].T
     uv = projected[..., :2] / np.maximum(projected[..., 2:], 1e-6)
     return float(((uv > 0) & (uv < 1)).all(axis=-1).mean())

@@ -53,7 +53,7 @@ def test_the_own_file_keeps_ranges_and_many_coefficients(tmp_path):
     write_cameras(tmp_path / "c.json", cameras)
     (camera,) = read_cameras(tmp_path / "c.json")
     assert camera.distortion == cameras[0].distortion and camera.depth_range == (0.5, 7.25)
-    with pytest.raises(InputError, match=r"0: has 12 coefficients .*transforms\.json knows k1, k2, p1, p2, k3"):
+    with pytest.raises(InputError, match=r"0: has 12 distortion coefficients.*can hold k1, k2, p1, p2, k3"):
         write_cameras(tmp_path / "transforms.json", cameras)
 
 

@@ -153,5 +153,5 @@ def test_colmap_counts_that_promise_too_much(tmp_path, part, count):
     colmap_model(small()).write_binary(tmp_path)
     path = tmp_path / f"{part}.bin"
     path.write_bytes(count.to_bytes(8, "little") + path.read_bytes()[8:])
-    with pytest.raises(InputError, match=rf"{part}\.bin .*cut off or damaged"):
+    with pytest.raises(InputError, match=rf"{part}\.bin .*truncated or damaged"):
         read_cameras(tmp_path)

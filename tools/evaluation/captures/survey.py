@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ....runtime.cameras.camera import Camera, resize_camera
+from ....runtime.geometry.baselines import pairwise_baselines
 from ....runtime.geometry.rigid import invert_rigid
 from ....runtime.images.io import load_image
 from ....runtime.sfm.features import match_features, normalize_points, sampson_distance
@@ -58,9 +59,8 @@ def _survey(pairs: Sequence[tuple[Path, Camera]]) -> Survey:
         depths = np.concatenate([np.zeros(0), *(values for _, values in found)])
         if len(depths) >= MIN_MATCHES:
             depth[i] = np.median(depths)
-    positions = np.stack([camera.extrinsics[:3, 3] for camera in cameras])
-    apart = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
-    return Survey(depth, error, score_pairs(cameras, depth).overlap, apart / np.sqrt(depth[:, None] * depth[None]))
+    baselines = pairwise_baselines(np.stack([camera.extrinsics for camera in cameras]))
+    return Survey(depth, error, score_pairs(cameras, depth).overlap, baselines / np.sqrt(depth[:, None] * depth[None]))
 
 
 def _sample(path: Path, camera: Camera) -> FeatureImage:

@@ -19,7 +19,7 @@ from ....runtime.inference.normalization import SceneNormalization
 from ....runtime.views.batch import ViewBatch, build_view_batch
 from ....runtime.views.depth_range import estimate_depth_range
 from ....runtime.views.loader import load_view
-from ...synthetic.sampler import crop_intrinsics
+from ...synthetic.sampler import zoom_intrinsics
 from .samples import SampleSpec, TrainingViews
 
 CAMERAS = "transforms.json"
@@ -111,7 +111,7 @@ def _load_crop(
     top, left = (int(rng.integers((zoom - 1) * side + 1)) for side in (spec.height, spec.width))
     image = view.image[:, top : top + spec.height, left : left + spec.width].copy()
     corner = np.array([left / spec.width, top / spec.height])
-    return torch.from_numpy(image), torch.from_numpy(crop_intrinsics(view.intrinsics, zoom, corner).astype(np.float32))
+    return torch.from_numpy(image), torch.from_numpy(zoom_intrinsics(view.intrinsics, zoom, corner).astype(np.float32))
 
 
 def _read_posed(folder: Path) -> PosedPaths:
