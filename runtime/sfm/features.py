@@ -1,6 +1,7 @@
-"""Points that two photographs share: found by SIFT, matched both ways, held against the epipolar line, triangulated.
+"""Local features and two-view geometry: SIFT, mutual matching, the Sampson distance and triangulation.
 
-Places in a picture are pixels with the centre of the first at (.5, .5); rays are (x / z, y / z) in a camera's frame.
+Keypoints are in pixels, with the centre of the top left pixel at (0.5, 0.5). Normalised image coordinates are
+(X / Z, Y / Z) in the frame of a camera, that is, on the plane Z = 1.
 """
 
 from dataclasses import dataclass
@@ -11,76 +12,82 @@ import numpy as np
 from ..geometry.intrinsics import HALF_PIXEL
 from ..geometry.rigid import invert_rigid
 
-MOST_FEATURES = 4000  # of one picture
-CONTRAST = 0.02  # half of SIFT's own threshold, for indoor walls
-DISTINCT = 0.8  # a match's distance over that of the second best
-TINY = 1e-12
+MAX_FEATURES = 4000  # of one image
+CONTRAST_THRESHOLD = 0.02  # half of OpenCV's default, for indoor walls
+MAX_RATIO = 0.8  # of the distances of the best and the second best match (Lowe 2004, section 7.1)
+EPSILON = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """keypoints: pixels [features, 2]. descriptors: roots of SIFT's shares, of length 1, float32 [features, 128]."""
+    """keypoints: pixels [features, 2]. descriptors: RootSIFT, of length 1, float32 [features, 128]."""
 
     keypoints: np.ndarray
     descriptors: np.ndarray
 
 
-def extract_features(image: np.ndarray, most: int = MOST_FEATURES) -> Features:
-    """SIFT features of a picture, uint8 RGB [height, width, 3] or grey [height, width]; maybe none."""
+def extract_features(image: np.ndarray, max_features: int = MAX_FEATURES) -> Features:
+    """SIFT features of an image, uint8 RGB [height, width, 3] or grey [height, width]; may be none."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
-    # Without the precise upscale, OpenCV's keypoints lie a quarter of a pixel too far to the right and down.
-    sift = cv2.SIFT.create(most, contrastThreshold=CONTRAST, enable_precise_upscale=True)
+    # Without the precise upscale, OpenCV's keypoints are shifted by a quarter of a pixel to the right and down.
+    sift = cv2.SIFT.create(max_features, contrastThreshold=CONTRAST_THRESHOLD, enable_precise_upscale=True)
     found, descriptors = sift.detectAndCompute(grey, None)
     if descriptors is None:
         return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
     keypoints = np.array([keypoint.pt for keypoint in found]) + HALF_PIXEL
-    # Distances between square roots of SIFT's histograms tell matches apart better (RootSIFT).
-    shares = descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), TINY)
-    return Features(keypoints, np.sqrt(shares).astype(np.float32))
+    # RootSIFT (Arandjelovic & Zisserman 2012): square roots of the L1-normalised histograms.
+    normalized = descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), EPSILON)
+    return Features(keypoints, np.sqrt(normalized).astype(np.float32))
 
 
 def match_features(first: Features, second: Features) -> np.ndarray:
-    """Pairs of indices [matches, 2]: features that are each other's nearest, clearly nearer than the next."""
+    """Index pairs [matches, 2] of mutual nearest neighbours that pass the ratio test."""
     if min(len(first.keypoints), len(second.keypoints)) < 2:
         return np.zeros((0, 2), int)
-    # Descriptors have length 1: one minus the likeness is half the squared distance.
-    likeness = first.descriptors @ second.descriptors.T  # [first, second]
-    forth, back = likeness.argmax(axis=1), likeness.argmax(axis=0)
-    rows = np.arange(len(forth))
-    best = likeness[rows, forth]
-    likeness[rows, forth] = -1
-    next_best = likeness.max(axis=1)
-    good = (back[forth] == rows) & (1 - best < DISTINCT**2 * (1 - next_best))
-    return np.stack([rows, forth], axis=1)[good]
+    # Descriptors have length 1, so 1 - similarity is half the squared distance.
+    similarity = first.descriptors @ second.descriptors.T  # [first, second]
+    forward, backward = similarity.argmax(axis=1), similarity.argmax(axis=0)
+    rows = np.arange(len(forward))
+    best = similarity[rows, forward]
+    similarity[rows, forward] = -1
+    next_best = similarity.max(axis=1)
+    good = (backward[forward] == rows) & (1 - best < MAX_RATIO**2 * (1 - next_best))
+    return np.stack([rows, forward], axis=1)[good]
 
 
-def normalize_points(keypoints: np.ndarray, K: np.ndarray) -> np.ndarray:
-    """Points [points, 2] in a picture of a pinhole camera K [3, 3] as rays [points, 2]."""
-    return (keypoints - K[:2, 2]) / np.diag(K)[:2]
+def normalize_points(points: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """Normalised image coordinates [points, 2] of pixels [points, 2]. K: intrinsics without skew, [3, 3]."""
+    return (points - K[:2, 2]) / np.diag(K)[:2]
 
 
 def sampson_distance(
     first: np.ndarray, second: np.ndarray, second_from_first: np.ndarray, signed: bool = False
 ) -> np.ndarray:
-    """How far two rays, both [points, 2], are from meeting: Sampson's distance [points], on the plane z = 1.
+    """Sampson distance of matches, [points], in normalised image coordinates: the first-order geometric error
 
-    second_from_first: what takes points from the first camera's frame to the second's, [4, 4].
+        |x2^T E x1| / sqrt((E x1)_1^2 + (E x1)_2^2 + (E^T x2)_1^2 + (E^T x2)_2^2),    E = [t]x R
+
+    (Hartley & Zisserman, Multiple View Geometry, 2nd ed.: eq. 9.12 for E, and the square root of eq. 11.9).
+    first, second: matched normalised image coordinates, [points, 2] each.
+    second_from_first: transforms points from the first camera's frame to the second's, [4, 4].
+    signed: with the sign of x2^T E x1, for least squares.
     """
     rotation, (x, y, z) = second_from_first[:3, :3], second_from_first[:3, 3]
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
     ones = np.ones((len(first), 1))
-    lines = np.hstack([first, ones]) @ essential.T  # [points, 3], in the second picture
-    lines_back = np.hstack([second, ones]) @ essential
+    lines = np.hstack([first, ones]) @ essential.T  # E x1, epipolar lines in the second image, [points, 3]
+    lines_back = np.hstack([second, ones]) @ essential  # E^T x2
     residual = (np.hstack([second, ones]) * lines).sum(axis=1)
-    slope = (lines[:, :2] ** 2).sum(axis=1) + (lines_back[:, :2] ** 2).sum(axis=1)
-    error = residual / np.sqrt(np.maximum(slope, TINY))
+    gradient = (lines[:, :2] ** 2).sum(axis=1) + (lines_back[:, :2] ** 2).sum(axis=1)
+    error = residual / np.sqrt(np.maximum(gradient, EPSILON))
     return error if signed else np.abs(error)
 
 
 def triangulate(first: np.ndarray, second: np.ndarray, second_from_first: np.ndarray) -> np.ndarray:
-    """Where rays [points, 2] of two cameras come closest to meeting, in the first camera's frame, [points, 3].
+    """Midpoint triangulation (Hartley & Sturm 1997, section 5.3): points [points, 3] in the first camera's frame.
 
-    Parallel rays meet far away, or behind the cameras.
+    A point is the midpoint between the closest points of its two viewing rays. first, second: normalised image
+    coordinates, [points, 2] each. Points of nearly parallel rays are far away, or behind the cameras.
     """
     ones = np.ones((len(first), 1))
     first_from_second = invert_rigid(second_from_first)
@@ -88,16 +95,16 @@ def triangulate(first: np.ndarray, second: np.ndarray, second_from_first: np.nda
     b = np.hstack([second, ones]) @ first_from_second[:3, :3].T
     a, b = a / np.linalg.norm(a, axis=1, keepdims=True), b / np.linalg.norm(b, axis=1, keepdims=True)
     centre = first_from_second[:3, 3]
-    # Least squares of |s a - (centre + t b)|: two equations in s and t.
+    # The minimum of |s a - (centre + t b)|^2: two linear equations in s and t.
     cosine = (a * b).sum(axis=1)
-    sine_squared = np.maximum(1 - cosine**2, TINY)
+    sine_squared = np.maximum(1 - cosine**2, EPSILON)
     s = (a @ centre - cosine * (b @ centre)) / sine_squared
     t = (cosine * (a @ centre) - b @ centre) / sine_squared
     return (s[:, None] * a + centre + t[:, None] * b) / 2
 
 
 def parallax_angles(points: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """The angle in degrees [points] between the sights of points [points, 3] from the origin and from `centre` [3]."""
+    """Angles in degrees [points] between viewing rays to points [points, 3] from the origin and from `centre` [3]."""
     other = points - centre
     cross = np.linalg.norm(np.cross(points, other), axis=1)
     return np.degrees(np.arctan2(cross, (points * other).sum(axis=1)))

@@ -1,4 +1,4 @@
-"""More than two images without cameras: our features and matches, COLMAP's mapper (pycolmap, extra `colmap`)."""
+"""Incremental structure from motion for more than two images: own features and matches, COLMAP's mapper (pycolmap)."""
 
 import importlib.util
 from collections.abc import Sequence
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
     from .estimate import UncalibratedImage
 
-MODEL = "SIMPLE_RADIAL"
-USUAL_FOCAL = 1.0  # in longer sides of the picture: where the search for the focal length starts
-ALL_PAIRS = 20  # up to so many images each is matched with each, above with those next in order
-NEXT = (1, 2, 3, 4, 6, 8, 12, 16)
-FEWEST_MATCHES = 30
+CAMERA_MODEL = "SIMPLE_RADIAL"
+INITIAL_FOCAL = 1.0  # in longer image sides, where the focal length is unknown
+MAX_EXHAUSTIVE = 20  # images that are matched exhaustively; more are matched with these next ones in order
+SEQUENTIAL_OFFSETS = (1, 2, 3, 4, 6, 8, 12, 16)
+MIN_MATCHES = 30
 SEED = 0
 
 
@@ -37,10 +37,10 @@ def check_pycolmap(images: int) -> None:
 
 
 def run_incremental_sfm(images: "Sequence[UncalibratedImage]", refine_focal: bool) -> tuple[list[Camera], np.ndarray]:
-    """The cameras of the images that fit together, in any frame and unit, and the depths of what they see.
+    """The cameras of the registered images, in an arbitrary world frame and unit, and the depths of their points.
 
-    refine_focal: the images' focal lengths, where known, are no more than a start.
-    Raises InputError where nothing fits together.
+    refine_focal: refine known focal lengths, too.
+    Raises InputError if no reconstruction is found.
     """
     import pycolmap
 
@@ -48,13 +48,13 @@ def run_incremental_sfm(images: "Sequence[UncalibratedImage]", refine_focal: boo
     with scratch_folder() as folder:
         database_path = folder / "database.db"
         _fill(database_path, images)
-        with working("placing images"):
+        with working("registering images"):
             pycolmap.geometric_verification(database_path)
             models = pycolmap.incremental_mapping(database_path, folder, folder, _options(refine_focal))
     if not models:
         raise InputError(
-            f"--cameras estimate: the {len(images)} images do not fit together; give more of them, that "
-            "overlap and show texture, taken from places a step apart"
+            f"--cameras estimate: none of the {len(images)} images could be registered; give more images that overlap, "
+            "show texture, and are taken a step apart"
         )
     best = max(models.values(), key=lambda model: model.num_reg_images())
     path_of = {_name(index): image.path for index, image in enumerate(images)}
@@ -63,7 +63,7 @@ def run_incremental_sfm(images: "Sequence[UncalibratedImage]", refine_focal: boo
 
 
 def _name(index: int) -> str:
-    """What an image is called in the database: any two images have different names, in order."""
+    """The name of an image in the database: unique, and sorted as the images are."""
     return f"{index:06}"
 
 
@@ -83,7 +83,7 @@ def _fill(database_path: Path, images: "Sequence[UncalibratedImage]") -> None:
             database.write_keypoints(image_ids[-1], image.features.keypoints.astype(np.float32))
         for i, j in progress(_pairs(len(images)), "matching images"):
             matches = match_features(images[i].features, images[j].features)
-            if len(matches) >= FEWEST_MATCHES:
+            if len(matches) >= MIN_MATCHES:
                 database.write_matches(image_ids[i], image_ids[j], matches.astype(np.uint32))
 
 
@@ -91,19 +91,19 @@ def _write_camera(database: "pycolmap.Database", image: "UncalibratedImage") -> 
     import pycolmap
 
     width, height = image.width, image.height
-    focal = image.focal or USUAL_FOCAL * max(width, height)
-    camera = pycolmap.Camera(model=MODEL, width=width, height=height, params=[focal, width / 2, height / 2, 0.0])
+    focal = image.focal or INITIAL_FOCAL * max(width, height)
+    camera = pycolmap.Camera(model=CAMERA_MODEL, width=width, height=height, params=[focal, width / 2, height / 2, 0.0])
     camera.has_prior_focal_length = image.focal is not None
     return int(database.write_camera(camera))
 
 
 def _pairs(count: int) -> list[tuple[int, int]]:
-    """Which images to match."""
-    return [(i, j) for i, j in combinations(range(count), 2) if count <= ALL_PAIRS or j - i in NEXT]
+    """The pairs of images to match."""
+    return [(i, j) for i, j in combinations(range(count), 2) if count <= MAX_EXHAUSTIVE or j - i in SEQUENTIAL_OFFSETS]
 
 
 def _options(refine_focal: bool) -> "pycolmap.IncrementalPipelineOptions":
-    """The mapper's own, but for captures of few images taken close to each other."""
+    """The defaults, relaxed for captures of few images with short baselines."""
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()

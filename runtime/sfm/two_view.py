@@ -1,4 +1,9 @@
-"""Where the second of two cameras stands, from the rays along which both see the same points."""
+"""Relative pose of two calibrated views from matched normalised image coordinates.
+
+The essential matrix is estimated by five-point RANSAC (Nister 2004, in OpenCV) and decomposed into four poses, of which
+the one with most points in front of both cameras is kept (Hartley & Zisserman, section 9.6.3). That pose is refined by
+minimising the Sampson distance.
+"""
 
 from dataclasses import dataclass
 
@@ -7,23 +12,23 @@ import numpy as np
 
 from .features import parallax_angles, sampson_distance, triangulate
 
-# Estimators differ in where they go wrong; each gives a start, and the one that explains most is kept.
+# Variants of RANSAC fail on different inputs; each gives an initial pose, and the one with most inliers is kept.
 ESTIMATORS = (cv2.USAC_MAGSAC, cv2.USAC_ACCURATE, cv2.RANSAC)
 CONFIDENCE = 0.9999
-FEWEST_MATCHES = 8
+MIN_MATCHES = 8
 REFINEMENTS = 20
-STEP = 1e-6  # for numeric derivatives: radians, and shares of the baseline
+STEP = 1e-6  # for numeric derivatives, in radians
 DAMPING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class TwoViewGeometry:
-    """Two cameras and what both see.
+    """The relative pose of two views and the points that both see.
 
-    second_from_first: takes points from the first camera's frame to the second's, [4, 4]; the baseline is 1.
-    inliers: which of the given rays agree with it, and meet before both cameras, bool [rays].
-    points: where those meet, in the first camera's frame, [points, 3].
-    parallax_deg: median angle between the two sights of a point.
+    second_from_first: transforms points from the first camera's frame to the second's, [4, 4]; the baseline is 1.
+    inliers: matches below the tolerance whose point is in front of both cameras, bool [matches].
+    points: the triangulated inliers, in the first camera's frame, [points, 3].
+    parallax_deg: median angle between the two viewing rays of a point.
     """
 
     second_from_first: np.ndarray
@@ -33,37 +38,41 @@ class TwoViewGeometry:
 
 
 def estimate_relative_pose(first: np.ndarray, second: np.ndarray, tolerance: float) -> TwoViewGeometry | None:
-    """The relative pose that most rays agree with, or None where none is found.
+    """The relative pose with most inliers, or None if none is found.
 
-    first, second: rays (x / z, y / z) [rays, 2] of the two cameras, some of them of different points.
-    tolerance: how far a ray may lie from where it should, on the plane z = 1; about a pixel over the focal length.
+    first, second: matched normalised image coordinates, with outliers, [matches, 2] each.
+    tolerance: maximum Sampson distance of an inlier; about a pixel divided by the focal length.
     """
-    if len(first) < FEWEST_MATCHES:
+    if len(first) < MIN_MATCHES:
         return None
-    starts = [pose for method in ESTIMATORS for pose in _starts(first, second, tolerance, method)]
-    if not starts:
+    initial = [pose for method in ESTIMATORS for pose in _initial_poses(first, second, tolerance, method)]
+    if not initial:
         return None
-    refined = [_refine(first, second, pose, tolerance) for pose in starts]
-    found = [_explain(first, second, pose, tolerance) for pose in refined]
-    return max(found, key=lambda views: int(views.inliers.sum()))
+    refined = [_refine(first, second, pose, tolerance) for pose in initial]
+    geometries = [_triangulate_inliers(first, second, pose, tolerance) for pose in refined]
+    return max(geometries, key=lambda geometry: int(geometry.inliers.sum()))
 
 
 def rotation_only_inlier_ratio(first: np.ndarray, second: np.ndarray, tolerance: float) -> float:
-    """The share of rays, as for `estimate_relative_pose`, that a camera which only turned would have seen as well."""
-    a, b = (np.hstack([rays, np.ones((len(rays), 1))]) for rays in (first, second))
+    """The fraction of matches that a pure rotation explains: viewing rays that agree after it, up to the tolerance.
+
+    The rotation is the solution of a robust Kabsch (orthogonal Procrustes) problem, by iteratively reweighted least
+    squares. Arguments as for `estimate_relative_pose`.
+    """
+    a, b = (np.hstack([points, np.ones((len(points), 1))]) for points in (first, second))
     a, b = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (a, b))
     weights = np.ones(len(a))
     for _ in range(REFINEMENTS):
         u, _, vt = np.linalg.svd((b * weights[:, None]).T @ a)
-        turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt  # Kabsch's rotation from the first to the second
-        off = np.linalg.norm(a @ turn.T - b, axis=1)
-        weights = 1 / (1 + (off / tolerance) ** 2)
-    return float((off < tolerance).mean())
+        rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt  # from the first view to the second
+        residual = np.linalg.norm(a @ rotation.T - b, axis=1)
+        weights = 1 / (1 + (residual / tolerance) ** 2)
+    return float((residual < tolerance).mean())
 
 
-def _starts(first: np.ndarray, second: np.ndarray, tolerance: float, method: int) -> list[np.ndarray]:
-    """The poses that an estimator's essential matrix allows, the one with most points before both cameras."""
-    scale = 1 / tolerance  # so that a pixel is the unit, as the estimators like it
+def _initial_poses(first: np.ndarray, second: np.ndarray, tolerance: float, method: int) -> list[np.ndarray]:
+    """The pose of the essential matrix that an estimator finds, with most points in front of both cameras; or none."""
+    scale = 1 / tolerance  # the estimators expect units of about a pixel
     K = np.diag([scale, scale, 1.0])
     try:
         essential, _ = cv2.findEssentialMat(
@@ -75,7 +84,7 @@ def _starts(first: np.ndarray, second: np.ndarray, tolerance: float, method: int
         return []
     rotations = cv2.decomposeEssentialMat(essential[:3])
     candidates = [_pose(rotation, sign * rotations[2].ravel()) for rotation in rotations[:2] for sign in (1, -1)]
-    return [max(candidates, key=lambda pose: int(_explain(first, second, pose, tolerance).inliers.sum()))]
+    return [max(candidates, key=lambda pose: int(_triangulate_inliers(first, second, pose, tolerance).inliers.sum()))]
 
 
 def _pose(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
@@ -84,31 +93,31 @@ def _pose(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
     return pose
 
 
-def _explain(first: np.ndarray, second: np.ndarray, pose: np.ndarray, tolerance: float) -> TwoViewGeometry:
-    """What a pose makes of the rays."""
+def _triangulate_inliers(first: np.ndarray, second: np.ndarray, pose: np.ndarray, tolerance: float) -> TwoViewGeometry:
+    """The inliers of a pose, and their points."""
     points = triangulate(first, second, pose)
-    there = points @ pose[:3, :3].T + pose[:3, 3]
-    inliers = (sampson_distance(first, second, pose) < tolerance) & (points[:, 2] > 0) & (there[:, 2] > 0)
+    in_second = points @ pose[:3, :3].T + pose[:3, 3]
+    inliers = (sampson_distance(first, second, pose) < tolerance) & (points[:, 2] > 0) & (in_second[:, 2] > 0)
     points = points[inliers]
     angles = parallax_angles(points, -pose[:3, :3].T @ pose[:3, 3])
     return TwoViewGeometry(pose, inliers, points, float(np.median(angles)) if len(points) else 0.0)
 
 
 def _refine(first: np.ndarray, second: np.ndarray, pose: np.ndarray, tolerance: float) -> np.ndarray:
-    """Move a pose to where the rays' errors are least, far-off ones counting ever less (Cauchy's weights)."""
+    """Minimise the Sampson distances by Gauss-Newton steps with Cauchy weights against outliers."""
     for _ in range(REFINEMENTS):
         errors = sampson_distance(first, second, pose, signed=True)
         steps = np.eye(5) * STEP
-        moved = [sampson_distance(first, second, _moved(pose, step), signed=True) for step in steps]
-        slopes = (np.stack(moved, axis=1) - errors[:, None]) / STEP  # [rays, 5]
-        weighted = slopes / (1 + (errors / tolerance) ** 2)[:, None]
-        change = np.linalg.solve(weighted.T @ slopes + DAMPING * np.eye(5), -weighted.T @ errors)
-        pose = _moved(pose, change)
+        shifted = [sampson_distance(first, second, _perturbed(pose, step), signed=True) for step in steps]
+        jacobian = (np.stack(shifted, axis=1) - errors[:, None]) / STEP  # [matches, 5]
+        weighted = jacobian / (1 + (errors / tolerance) ** 2)[:, None]
+        change = np.linalg.solve(weighted.T @ jacobian + DAMPING * np.eye(5), -weighted.T @ errors)
+        pose = _perturbed(pose, change)
     return pose
 
 
-def _moved(pose: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """A pose turned by three angles, its translation turned by two about axes across it: change [5]."""
+def _perturbed(pose: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """A pose after a change [5]: a rotation vector, and two components of translation in the plane tangent to it."""
     translation = pose[:3, 3]
-    across = np.linalg.svd(translation[None])[2][1:]  # two directions at right angles to it, [2, 3]
-    return _pose(cv2.Rodrigues(change[:3])[0] @ pose[:3, :3], translation + change[3:] @ across)
+    tangents = np.linalg.svd(translation[None])[2][1:]  # an orthonormal basis of the plane, [2, 3]
+    return _pose(cv2.Rodrigues(change[:3])[0] @ pose[:3, :3], translation + change[3:] @ tangents)

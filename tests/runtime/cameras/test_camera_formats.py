@@ -269,9 +269,9 @@ def test_stereo_calibration(tmp_path, suffix, size):
     if size:
         assert [camera.name for camera in read_cameras(path)] == ["left", "right"]
     else:
-        with pytest.raises(InputError, match="camera 1: gives no imageSize"):
+        with pytest.raises(InputError, match="camera 1: has no imageSize"):
             read_cameras(path)
-    with pytest.raises(InputError, match="calibrates two cameras, and 1 images were given"):
+    with pytest.raises(InputError, match="calibrates two cameras, but 1 images are given"):
         read_cameras(path, pictures[:1])
 
 
@@ -288,7 +288,7 @@ def test_stereo_calibration_in_two_files(tmp_path):
     text = (tmp_path / "whole.yml").read_text()
     start, end = text.index("R: !!opencv"), text.index("image_width")
     (tmp_path / "extrinsics.yml").write_text("%YAML:1.0\n---\n" + text[start:end])
-    with pytest.raises(InputError, match="gives no imageSize"):
+    with pytest.raises(InputError, match="has no imageSize"):
         read_cameras(tmp_path / "extrinsics.yml", camera_format=CameraFormat.OPENCV)
     (tmp_path / "intrinsics.yml").write_text(text[:start] + text[end:])
     for name in ("intrinsics.yml", "extrinsics.yml"):
@@ -300,7 +300,7 @@ def test_stereo_calibration_in_two_files(tmp_path):
 
 def test_unknown_content_names_what_is_known(tmp_path):
     (tmp_path / "notes.txt").write_text("hello\n")
-    with pytest.raises(InputError, match=r"none of the camera files .*COLMAP.*--camera-format"):
+    with pytest.raises(InputError, match=r"no cameras of a known format.*COLMAP.*--camera-format"):
         read_cameras(tmp_path / "notes.txt")
 
 

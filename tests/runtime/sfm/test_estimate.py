@@ -112,11 +112,11 @@ def test_refusals(room, tmp_path, monkeypatch):
         ([first, second], None, "tells no focal length; give --focal"),
         ([first, second], "wide", "--focal wide: expected pixels"),
         ([first, second], "999999", r"000\.png: the focal lengths .* not plausible"),
-        ([first, first], focal, r"too nearly the same place: .*expected 1\.5 at least; step aside"),
-        ([first, rotated], focal, "too nearly the same place"),
-        ([first, blank], focal, "0 points found in both, expected 40 at least"),
-        ([first, noise], focal, "points found in both, expected"),
-        ([first, blank, noise], focal, "the 3 images do not fit together"),
+        ([first, first], focal, r"nearly the same place: .*expected 1\.5 at least; step aside"),
+        ([first, rotated], focal, "nearly the same place"),
+        ([first, blank], focal, "0 features match, expected 40 at least"),
+        ([first, noise], focal, "(features match|matches are inliers of a static scene), expected"),
+        ([first, blank, noise], focal, "none of the 3 images could be registered"),
     ):
         with pytest.raises(InputError, match=expected) as caught:
             estimate_cameras(pictures, given)
