@@ -1,4 +1,4 @@
-"""Views: pictures and cameras brought together, the ones to use chosen, and the arrays the network takes."""
+"""The view batch: images matched to cameras, views selected, and the arrays of the network's input."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -21,25 +21,25 @@ from .selection import MIN_VIEWS, score_pairs, select_views
 
 EXAMPLES = 3  # names listed in a message
 
-SAME_PLACE = 1e-4  # of the longest baseline
-SAME_ROTATION = 1e-4  # largest difference of two rotation matrices
-ROUNDINGS = 4  # of the distance from the origin, in steps of the poses' own type
-RANGE_SLACK = 1e-3  # how far resampling may have carried a pixel outside [0, 1]
+SAME_POSITION = 1e-4  # relative to the longest baseline
+SAME_ROTATION = 1e-4  # largest difference between the elements of two rotation matrices
+ROUNDING_STEPS = 4  # of the poses' floating-point type, at the largest coordinate
+RANGE_TOLERANCE = 1e-3  # by which resampling may exceed [0, 1]
 
 
 @dataclass(frozen=True, eq=False)
 class ViewBatch:
-    """What the network takes, and the cameras it came from.
+    """The network's input for a set of views, and their cameras.
 
-    names: file names of the pictures, [views].
+    names: file names of the images, [views].
     images: float32 RGB in [0, 1], [views, 3, height, width].
-    extrinsics: float64, camera-to-world, OpenCV axes, in the world frame and unit that the user gave, [views, 4, 4].
-    intrinsics: float32, row 0 divided by the width and row 1 by the height, [views, 3, 3].
-    cameras: the same cameras undistorted, at the full size of the pictures, [views].
-    selection_reason: how these views were chosen of more, in words; empty where there was no selection.
-    offset: what was subtracted from the user's world coordinates, float64 [3]; see `world_offset`.
+    extrinsics: camera-to-world, OpenCV axes, in the input's world frame and unit, float64 [views, 4, 4].
+    intrinsics: normalised (row 0 divided by the width, row 1 by the height), float32 [views, 3, 3].
+    cameras: the cameras, undistorted, at the full size of the images, [views].
+    selection_reason: why these views were selected, for the user; empty if all are used.
+    offset: subtracted from the input's world coordinates, float64 [3]; see `world_offset`.
     feature_images: the images for feature extraction, [views]; empty where every camera has a depth range.
-    skipped: what is wrong with images that could not be read and were left out, a line for each.
+    skipped: a line for each image that could not be read and was left out.
     """
 
     names: list[str]
@@ -54,11 +54,11 @@ class ViewBatch:
 
 
 def match_images_to_cameras(images: Sequence[Path], cameras: Sequence[Camera]) -> list[tuple[Path, Camera]]:
-    """Give each picture the camera that names it, in the order of the pictures; cameras may be left over.
+    """Pair each image with the camera that names it, in the order of the images; cameras may be left over.
 
-    Names are compared without suffix (a transforms.json often has none); of several such cameras the one with the same
-    suffix, then the one with more folders in common, is taken. The order of the two lists plays no part.
-    Raises InputError if a picture has no camera or several equally good ones, or two pictures have the same.
+    Names are compared without suffix, which a transforms.json often lacks. Among several such cameras, one with the
+    same suffix is preferred, then one with more parent folders in common.
+    Raises InputError if an image has no camera or several equally good ones, or if two images have the same camera.
     """
     by_stem: dict[str, list[Camera]] = defaultdict(list)
     for camera in cameras:
@@ -88,13 +88,13 @@ def match_images_to_cameras(images: Sequence[Path], cameras: Sequence[Camera]) -
 def build_view_batch(
     pairs: Sequence[ImageCameraPair], count: int | None, height: int, width: int, skip_damaged: bool = False
 ) -> ViewBatch:
-    """Take the pictures (only `count` well chosen ones, if given), undistort them and bring them to height x width.
+    """Load views, undistorted and resized to height x width.
 
-    A picture is a file, or RGB [h, w, 3] in uint8, and is known by its camera's name. Each that is needed is read once.
-    skip_damaged: do without pictures that cannot be read, and name them in `ViewBatch.skipped`.
-
-    Raises InputError for fewer than two views, two cameras at the same pose, cameras without any baseline, a picture
-    that cannot be read or has another size than its camera.
+    pairs: images, as files or uint8 RGB [h, w, 3], with their cameras. Each image that is needed is read once.
+    count: select this many views; all by default.
+    skip_damaged: leave out images that cannot be read, and list them in `ViewBatch.skipped`.
+    Raises InputError for fewer than two views, two cameras with the same pose, cameras without a baseline, or an image
+    that cannot be read or whose size does not match its camera.
     """
     loader = ViewLoader(pairs, height, width)
     usable = list(range(len(pairs)))
@@ -105,7 +105,7 @@ def build_view_batch(
             image = "1 image" if len(usable) == 1 else f"{len(usable)} images"
             raise InputError(f"{image} with a camera, expected at least {MIN_VIEWS}{unread}; add images")
         try:
-            return _prepared(loader, usable, count, skipped)
+            return _build(loader, usable, count, skipped)
         except DamagedImage as error:
             damaged = {index for index in usable if isinstance(pairs[index][0], Path) and pairs[index][0] == error.path}
             if not skip_damaged or not damaged:
@@ -114,16 +114,16 @@ def build_view_batch(
             usable = [index for index in usable if index not in damaged]
 
 
-def _prepared(loader: ViewLoader, usable: Sequence[int], count: int | None, skipped: Sequence[str]) -> ViewBatch:
-    """The views of these images, or of `count` of them."""
+def _build(loader: ViewLoader, usable: Sequence[int], count: int | None, skipped: Sequence[str]) -> ViewBatch:
+    """The batch of the pairs with these indices, or of `count` of them."""
     selection_reason = ""
     if count is not None and count < len(usable):
-        usable, selection_reason = _choose(loader, usable, count)
+        usable, selection_reason = _select(loader, usable, count)
     cameras = [loader.pairs[index][1] for index in usable]
     extrinsics = np.stack([camera.extrinsics for camera in cameras])  # [views, 4, 4]
     _check_distinct(extrinsics, [camera.name for camera in cameras])
     loaded = [loader.load(index) for index in usable]
-    feature_images = [view.sample for view in loaded if view.sample is not None]
+    feature_images = [view.feature_image for view in loaded if view.feature_image is not None]
     return ViewBatch(
         [_path(camera.name).name for camera in cameras],
         np.stack([view.image for view in loaded]),
@@ -136,34 +136,34 @@ def _prepared(loader: ViewLoader, usable: Sequence[int], count: int | None, skip
     )
 
 
-def _choose(loader: ViewLoader, usable: Sequence[int], count: int) -> tuple[list[int], str]:
-    """The `count` best of these images with cameras, and why, in words.
+def _select(loader: ViewLoader, usable: Sequence[int], count: int) -> tuple[list[int], str]:
+    """Select `count` of these pairs; returns their indices and the reason, for the user.
 
-    How far the scene is decides what is a good baseline: cameras may know, and otherwise a few images are matched.
-    Raises InputError as `select_views` does, or where an image cannot be read.
+    The suitable baseline depends on the depth of the scene, which comes from the cameras or from matching a few images.
+    Raises InputError as `select_views`, or if an image cannot be read.
     """
     cameras = [loader.pairs[index][1] for index in usable]
-    distances, source = scene_depths(cameras, lambda index: loader.sample(usable[index]))
-    chosen = select_views(cameras, count, distances)
-    between = score_pairs([cameras[index] for index in chosen], distances[chosen])
+    depths, source = scene_depths(cameras, lambda index: loader.feature_image(usable[index]))
+    chosen = select_views(cameras, count, depths)
+    scores = score_pairs([cameras[index] for index in chosen], depths[chosen])
     i, j = np.array(nearest_neighbor_pairs(np.stack([cameras[index].extrinsics for index in chosen]))).T
-    overlap, parallax = between.overlap[i, j], between.parallax[i, j]
-    share = f"{100 * overlap.min():.0f} %" + (" or more" if len(i) > 1 else "")
+    overlap, parallax = scores.overlap[i, j], scores.parallax[i, j]
+    overlaps = f"{100 * overlap.min():.0f} %" + (" or more" if len(i) > 1 else "")
     angles = " to ".join(dict.fromkeys(f"{angle:.1f}" for angle in (parallax.min(), parallax.max())))
     selection_reason = (
-        f"neighbours share {share} of their view and stand {angles} degrees apart as seen from the scene, which is "
-        f"{np.median(distances[chosen]):.3g} away by {source}"
+        f"nearest neighbours overlap by {overlaps} with a parallax of {angles} degrees, at a scene depth of "
+        f"{np.median(depths[chosen]):.3g} from {source}"
     )
     return [usable[index] for index in chosen], selection_reason
 
 
 def check_view_arrays(images: Any, extrinsics: Any, intrinsics: Any, near: Any = None, far: Any = None) -> None:
-    """Check what the network is given, as `ViewBatch` describes it; near and far are one number or one for each view.
+    """Check the arrays of the network's input, as in `ViewBatch`.
 
-    What is None of them is yet to be found.
-
-    Raises InputError naming the argument and the view: wrong shape or type, NaN, a pose that is not rigid, intrinsics
-    that are not normalised, pixels outside [0, 1], not 0 < near < far, fewer than two views, cameras that coincide.
+    near, far: a number, or one for each view; None if not known yet.
+    Raises InputError that names the argument and the view: wrong shape or type, NaN, a pose that is not rigid,
+    intrinsics that are not normalised, pixels outside [0, 1], not 0 < near < far, fewer than two views, or coinciding
+    cameras.
     """
     images = _floats(images, "images", "[views, 3, height, width]", (None, 3, None, None))
     views = len(images)
@@ -172,7 +172,7 @@ def check_view_arrays(images: Any, extrinsics: Any, intrinsics: Any, near: Any =
     if views < MIN_VIEWS:
         raise InputError(f"images: {views} view given, expected at least {MIN_VIEWS}")
     low, high = images.min(), images.max()
-    if low < -RANGE_SLACK or high > 1 + RANGE_SLACK:
+    if low < -RANGE_TOLERANCE or high > 1 + RANGE_TOLERANCE:
         raise InputError(f"images: values from {low:g} to {high:g}, expected 0 to 1; divide 8-bit pixels by 255")
     for index in range(views):
         with error_context(f"extrinsics[{index}]"):
@@ -191,7 +191,7 @@ def _path(name: str) -> PurePosixPath:
 
 
 def _best(image: Path, candidates: Sequence[Camera]) -> Camera:
-    """The candidate that agrees most with the image's path; raises InputError if two do equally."""
+    """The camera whose name agrees most with the image's path. Raises InputError for a tie."""
     agreement = [_agreement(image, _path(camera.name)) for camera in candidates]
     best = [camera for camera, value in zip(candidates, agreement, strict=True) if value == max(agreement)]
     if len(best) > 1:
@@ -201,7 +201,7 @@ def _best(image: Path, candidates: Sequence[Camera]) -> Camera:
 
 
 def _agreement(image: Path, name: PurePosixPath) -> tuple[bool, int]:
-    """Whether the file names are the same, and how many folders before them are."""
+    """Whether the file names are equal, and how many parent folders are."""
     folders = 0
     for ours, theirs in zip(reversed(image.parts[:-1]), reversed(name.parts[:-1]), strict=False):
         if ours != theirs:
@@ -218,19 +218,19 @@ def _examples(names: Sequence[object]) -> str:
 
 
 def _check_distinct(extrinsics: np.ndarray, names: Sequence[str]) -> None:
-    """Refuse cameras without any baseline, and two cameras at one pose."""
+    """Raise InputError for cameras without a baseline, and for two cameras with the same pose."""
     baselines = pairwise_baselines(extrinsics)
-    rounding = ROUNDINGS * float(np.finfo(extrinsics.dtype).eps * np.abs(extrinsics[:, :3, 3]).max())
+    rounding = ROUNDING_STEPS * float(np.finfo(extrinsics.dtype).eps * np.abs(extrinsics[:, :3, 3]).max())
     if baselines.max() <= rounding:
         raise InputError(
-            f"{names[0]} and {names[1]} stand at the same place, as do all cameras; depth needs a baseline"
+            f"{names[0]} and {names[1]} are at the same position, as are all cameras; depth needs a baseline"
         )
     rotations = extrinsics[:, :3, :3]
     for first in range(len(extrinsics)):
         same_rotation = np.abs(rotations - rotations[first]).max(axis=(1, 2)) <= SAME_ROTATION
-        same_place = baselines[first] <= max(SAME_PLACE * baselines.max(), rounding)
+        same_position = baselines[first] <= max(SAME_POSITION * baselines.max(), rounding)
         for second in range(first + 1, len(extrinsics)):
-            if same_rotation[second] and same_place[second]:
+            if same_rotation[second] and same_position[second]:
                 raise InputError(f"{names[first]} and {names[second]} have the same pose, expected two; leave one out")
 
 
@@ -238,15 +238,15 @@ def _check_distinct(extrinsics: np.ndarray, names: Sequence[str]) -> None:
 
 
 def _floats(array: Any, name: str, expected: str, shape: tuple[int | None, ...]) -> np.ndarray:
-    """The argument as an array, once its type, shape (None: any) and values are in order."""
+    """The argument as an array with checked type, shape (None: any size) and finite values."""
     try:
         array = np.asarray(array)
     except ValueError:  # rows of different lengths
         raise InputError(f"{name}: not an array, expected {expected}") from None
     if not np.issubdtype(array.dtype, np.floating):
         raise InputError(f"{name}: type {array.dtype}, expected float32, {expected}")
-    fits = array.ndim == len(shape) and all(b in (None, a) for a, b in zip(array.shape, shape, strict=True))
-    if not fits or array.size == 0:
+    is_expected = array.ndim == len(shape) and all(b in (None, a) for a, b in zip(array.shape, shape, strict=True))
+    if not is_expected or array.size == 0:
         given = f", {shape[0]} views being given" if shape[0] is not None else ""
         raise InputError(f"{name}: shape {array.shape}, expected {expected}{given}")
     if not np.isfinite(array).all():

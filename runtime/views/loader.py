@@ -1,4 +1,4 @@
-"""Images with cameras, each read and decoded once: what the network takes of it, and a sample to find features in."""
+"""Loading views: images read once, undistorted, resized to the network's input, with a copy for feature extraction."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,17 +19,17 @@ ImageCameraPair = tuple[
     Path | np.ndarray, Camera
 ]  # an image, as a file or as uint8 RGB [height, width, 3], and its camera
 
-SAMPLE_SIDE = 640  # pixels of the longer side of the copy in which features are looked for
+FEATURE_SIDE = 640  # pixels: longer side of the copy for feature extraction
 
 
 class FeatureImage:
-    """A small copy of an image without distortion, in which features are looked for, once and when first asked for.
+    """A small undistorted copy of an image, and its features, which are extracted when first needed.
 
-    camera: the copy's, without distortion.
+    camera: of the copy, without distortion.
     """
 
     def __init__(self, image: np.ndarray, camera: Camera) -> None:
-        factor = min(1, SAMPLE_SIDE / max(image.shape[:2]))
+        factor = min(1, FEATURE_SIDE / max(image.shape[:2]))
         width, height = max(1, round(camera.width * factor)), max(1, round(camera.height * factor))
         small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
         small, self.camera = undistort(small, resize_camera(camera, width, height))
@@ -37,59 +37,59 @@ class FeatureImage:
 
     @cached_property
     def features(self) -> Features:
-        """What SIFT finds, in pixels of the copy."""
+        """SIFT features, in pixels of the copy."""
         return extract_features(self._grey)
 
 
 @dataclass(frozen=True, eq=False)
 class LoadedView:
-    """One image as the network takes it.
+    """One view as the network's input.
 
     image: float32 RGB in [0, 1], [3, height, width]. intrinsics: normalised, float32 [3, 3].
     camera: undistorted, at the image's full size.
-    sample: None where no features are looked for.
+    feature_image: None if no features are needed.
     """
 
     image: np.ndarray
     intrinsics: np.ndarray
     camera: Camera
-    sample: FeatureImage | None
+    feature_image: FeatureImage | None
 
 
 class ViewLoader:
-    """Reads images with cameras when they are first asked for, and keeps what the network takes of them.
+    """Loads views when they are first needed, and keeps them.
 
-    height, width: the network's. Images are brought to it as `images.fit` says. Samples are taken unless all cameras
-    know the depths that they see, for which features are looked for.
+    height, width: of the network's input; images are resized by `resize_and_crop`. Feature images are made unless all
+    cameras have a depth range.
     """
 
     def __init__(self, pairs: Sequence[ImageCameraPair], height: int, width: int) -> None:
         self.pairs, self.height, self.width = pairs, height, width
-        self._sampled = any(camera.depth_range is None for _, camera in pairs)
+        self._with_features = any(camera.depth_range is None for _, camera in pairs)
         self._loaded: dict[int, LoadedView] = {}
 
     def load(self, index: int) -> LoadedView:
-        """One of the pairs; raises InputError where it cannot be read, or has another size than its camera."""
+        """The view of one of the pairs. Raises InputError as `load_view`."""
         if index not in self._loaded:
-            self._loaded[index] = load_view(self.pairs[index], self.height, self.width, self._sampled)
+            self._loaded[index] = load_view(self.pairs[index], self.height, self.width, self._with_features)
         return self._loaded[index]
 
-    def sample(self, index: int) -> FeatureImage:
-        """The sample of one of the pairs, where one is taken; raises as `load`."""
-        sample = self.load(index).sample
-        assert sample is not None, "features are looked for where depths are not known"
-        return sample
+    def feature_image(self, index: int) -> FeatureImage:
+        """The feature image of one of the pairs, if they are made. Raises InputError as `load_view`."""
+        feature_image = self.load(index).feature_image
+        assert feature_image is not None, "feature images are made unless all depth ranges are known"
+        return feature_image
 
 
-def load_view(pair: ImageCameraPair, height: int, width: int, sampled: bool = False) -> LoadedView:
-    """Read one image, undistort it and bring it to height x width.
+def load_view(pair: ImageCameraPair, height: int, width: int, with_features: bool = False) -> LoadedView:
+    """Read one image, undistort it, and resize and crop it to height x width.
 
-    Raises InputError where it cannot be read or has another size than its camera.
+    Raises InputError if it cannot be read, or if its size does not match its camera.
     """
     given, camera = pair
     image = given if isinstance(given, np.ndarray) else load_image(given)
     with error_context(camera.name):
         camera = resize_camera(camera, image.shape[1], image.shape[0])
-    sample = FeatureImage(image, camera) if sampled else None
+    feature_image = FeatureImage(image, camera) if with_features else None
     image, camera = undistort(image, camera)
-    return LoadedView(*resize_and_crop(image, camera.K, height, width), camera, sample)
+    return LoadedView(*resize_and_crop(image, camera.K, height, width), camera, feature_image)

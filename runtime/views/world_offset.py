@@ -1,8 +1,8 @@
-"""World coordinates that float32 does not hold: found out, and brought near the origin by an offset that is recorded.
+"""World offset: georeferenced coordinates that exceed the precision of float32.
 
-Splat files hold means in float32, whose steps grow with the distance from the origin: 8 mm at 100 km in metres, half a
-metre where a survey counts northings in millions. A scene there is written relative to an offset, and the file says so,
-where it can. The cameras of a scene stay in the user's own world; who uses both subtracts the offset from them.
+Splat files store means in float32, whose spacing grows with the distance from the origin: 8 mm at 100 km in metres,
+half a metre for northings in millions. Such a scene is written relative to an offset, which is recorded in formats that
+can hold it. Camera files stay in the input's world frame; to use them with the scene, subtract the offset from them.
 """
 
 from dataclasses import replace
@@ -18,9 +18,8 @@ if TYPE_CHECKING:
     from .batch import ViewBatch
 
 AUTO = "auto"
-# Of the smallest splats' size: as much may float32 move a mean without being seen. A splat of a pixel at the near plane
-# is taken for the smallest.
-LARGEST_STEP = 0.25
+# Largest invisible rounding of a mean, relative to the smallest splat, which is taken to be a pixel at the near plane.
+MAX_STEP = 0.25
 NO_OFFSET = np.zeros(3)
 
 
@@ -40,18 +39,18 @@ def parse_offset(text: str) -> np.ndarray | None:
 
 
 def float32_step(views: "ViewBatch") -> float:
-    """How far apart float32 can place means where these cameras stand, in world units."""
+    """The spacing of float32 at the largest camera coordinate, in world units."""
     return float(np.spacing(np.float32(np.abs(views.extrinsics[:, :3, 3]).max())))
 
 
 def loses_precision(views: "ViewBatch", near: float) -> bool:
-    """Whether float32 moves means visibly; near: the nearest depth, in world units."""
+    """Whether float32 rounds means visibly. near: in world units."""
     focal = (views.intrinsics[:, [0, 1], [0, 1]] * views.images.shape[:1:-1]).max()  # pixels
-    return float32_step(views) > LARGEST_STEP * near / float(focal)
+    return float32_step(views) > MAX_STEP * near / float(focal)
 
 
 def offset_views(views: "ViewBatch", offset: np.ndarray) -> "ViewBatch":
-    """The views in a world whose origin is at `offset` [3] of theirs."""
+    """The views in a world frame whose origin is at `offset` [3] in the present one."""
     extrinsics = views.extrinsics.astype(np.float64)
     extrinsics[:, :3, 3] -= offset
     return replace(
@@ -63,9 +62,9 @@ def offset_views(views: "ViewBatch", offset: np.ndarray) -> "ViewBatch":
 
 
 def apply_offset(views: "ViewBatch", text: str | None, near: float) -> "tuple[ViewBatch, list[str]]":
-    """The views relative to what --offset asks for, and lines for the user: what was done, or should be.
+    """The views relative to the offset in `text` (the option --offset), and notes for the user.
 
-    near: the nearest depth, in world units. Raises InputError as `parse_offset`.
+    near: in world units. Raises InputError as `parse_offset`.
     """
     notes = []
     if text is not None:
@@ -88,12 +87,12 @@ def apply_offset(views: "ViewBatch", text: str | None, near: float) -> "tuple[Vi
 
 
 def offset_text(offset: np.ndarray) -> str:
-    """An offset [3] as --offset takes it, every digit of it."""
+    """An offset [3] in the form of the option --offset, exactly."""
     return ",".join(f"{value:.17g}" if value != round(value) else f"{value:.0f}" for value in offset.tolist())
 
 
 def _middle(views: "ViewBatch", near: float) -> np.ndarray:
-    """The middle of the cameras, rounded to the power of ten that is as large as the scene."""
+    """The mean camera position, rounded to a multiple of the power of ten above the extent of the scene."""
     positions = views.extrinsics[:, :3, 3].astype(np.float64)
     extent = max(near, float(np.ptp(positions, axis=0).max()))
     unit = 10.0 ** np.ceil(np.log10(extent))

@@ -47,8 +47,8 @@ def test_everything_it_can_write(workplace, scene, capsys):
     assert summary["model"]["preset"] == "idesplat-small"
     true_depth = np.stack([np.load(path)["depth"] for path in (scene / "depth").iterdir()])
     assert 0.3 * true_depth.min() < summary["near"] < np.median(true_depth) < summary["far"] < 4 * true_depth.max()
-    assert "points matched between the photographs" in summary["near_far_from"]
-    assert "3 of 5 images used" in summary["notes"][0] and "degrees apart" in summary["notes"][0]
+    assert "points matched between the images" in summary["near_far_from"]
+    assert "3 of 5 images used" in summary["notes"][0] and "parallax" in summary["notes"][0]
     depths = sorted(Path("depth").glob("*.npz"))
     assert len(depths) == len(list(Path("depth").glob("*.png"))) == 3
     with np.load(depths[0]) as file:
@@ -230,7 +230,7 @@ def test_photographs_alone(workplace, tmp_path_factory, capsys):
     assert run_command(main, *given, "--focal", focal, "--save-cameras", "found.json") == 0
     printed = capsys.readouterr().out
     assert "cameras of 2 images estimated by OpenCV" in printed and "unit is the median depth" in printed
-    assert "what the cameras are known to see" in printed and "--cameras found.json" in printed
+    assert "the cameras' depth ranges" in printed and "--cameras found.json" in printed
     assert len(read_ply(Path("scene.ply"))) == 2 * 64 * 96
     assert run_command(render_main, "scene.ply", "--cameras", "found.json", "--out", "drawn") == 0
     assert run_command(main, *given, "--focal", focal) == 0

@@ -109,7 +109,7 @@ def test_refusals(room, tmp_path, monkeypatch):
     noise = save(tmp_path / "noise.png", np.random.default_rng(0).integers(0, 255, image.shape, np.uint8))
     for pictures, given, expected in (
         ([first], focal, "1 image given, expected two at least"),
-        ([first, second], None, "tells no focal length; give --focal"),
+        ([first, second], None, "has no focal length; give --focal"),
         ([first, second], "wide", "--focal wide: expected pixels"),
         ([first, second], "999999", r"000\.png: the focal lengths .* not plausible"),
         ([first, first], focal, r"nearly the same place: .*expected 1\.5 at least; step aside"),

@@ -77,7 +77,7 @@ def test_without_matches_the_baseline_decides(room):
 
 def test_the_scene_is_as_far_as_it_is(room):
     pairs, depth = room
-    distances, source = scene_depths([camera for _, camera in pairs], ViewLoader(pairs, 64, 96).sample)
+    distances, source = scene_depths([camera for _, camera in pairs], ViewLoader(pairs, 64, 96).feature_image)
     assert "points matched" in source
     assert 0.6 < distances[0] / np.median(depth) < 1.6
 

@@ -191,7 +191,7 @@ def test_large_captures_give_nearly_the_best_pair(name, monkeypatch):
     cameras = at(captures(200, seed=1)[name])
     scorer = PairScorer(cameras, guess_scene_depths(cameras))
     best = scorer.score(*np.triu_indices(len(cameras), 1)).cost.min()
-    monkeypatch.setattr(view_choice, "EXHAUSTIVE", 40)
+    monkeypatch.setattr(view_choice, "MAX_EXHAUSTIVE", 40)
     first, second = select_views(cameras, 2)
     found = scorer.score(np.array([first]), np.array([second])).cost[0]
     assert found <= best + 0.15  # a fifth of a parallax twice too large would be 0.26
@@ -260,8 +260,8 @@ def test_prepare_reads_only_the_chosen_where_depths_are_known(pairs):
     views = build_view_batch(pairs, 2, 32, 32)
     assert views.names == ["0.png", "1.png"]
     assert (
-        "degrees apart" in views.selection_reason
-        and "4 away by what the cameras are known to see" in views.selection_reason
+        "parallax" in views.selection_reason
+        and "a scene depth of 4 from the cameras' depth ranges" in views.selection_reason
     )
 
 
@@ -287,7 +287,7 @@ def test_prepare_mistakes(pairs):
         build_view_batch([(path0, camera0), (path1, replace(camera1, extrinsics=twin)), pairs[2]], None, 32, 32)
     same_place = camera1.extrinsics.copy()
     same_place[:3, 3] = camera0.extrinsics[:3, 3]
-    with pytest.raises(InputError, match=r"0\.png and 1\.png stand at the same place"):
+    with pytest.raises(InputError, match=r"0\.png and 1\.png are at the same position"):
         build_view_batch([(path0, camera0), (path1, replace(camera1, extrinsics=same_place))], None, 32, 32)
 
 
@@ -331,7 +331,7 @@ def put(array, index, value):
         ("extrinsics", lambda a: put(a, (1, 0, 3), np.inf), r"extrinsics\[1\]: holds NaN or infinity"),
         ("extrinsics", lambda a: put(a, (1, slice(3), slice(3)), 2 * np.eye(3)), r"extrinsics\[1\]: .*scaled"),
         ("extrinsics", lambda a: a @ np.diag([1, -1, 1, 1.0]), r"extrinsics\[0\]: .*mirrored"),
-        ("extrinsics", lambda a: put(a, 1, a[0]), "view 0 and view 1 stand at the same place"),
+        ("extrinsics", lambda a: put(a, 1, a[0]), "view 0 and view 1 are at the same position"),
         ("intrinsics", lambda a: a * np.array([[16], [8], [1]]), r"intrinsics\[0\], normalised .*principal point"),
         ("intrinsics", lambda a: put(a, (1, 0, 0), -1), r"intrinsics\[1\], .*focal lengths"),
         ("intrinsics", lambda a: put(a, (1, 0, 1), 0.1), r"intrinsics\[1\], .*no skew"),
