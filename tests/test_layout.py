@@ -1,9 +1,11 @@
 """The repository's layout: boundaries between packages, no circles of imports, and every package in the wheel."""
 
 import ast
+import shutil
 import subprocess
 import sys
 import tomllib
+import zipfile
 from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -121,6 +123,27 @@ def test_every_package_is_in_the_wheel() -> None:
     assert settings["package-dir"] == {"idesplat": "."}
     with_code = {path.parent for package in PACKAGES for path in (ROOT / package).rglob("*.py")}
     assert with_code == folders  # a folder without __init__.py would be missed
+
+
+@pytest.mark.slow
+def test_the_wheel_holds_every_module_and_data_file(tmp_path: Path) -> None:
+    """Built from a copy, since setuptools leaves files beside the sources, with the setuptools that is installed."""
+    source = tmp_path / "source"
+    ignored = shutil.ignore_patterns("__pycache__")
+    for package in PACKAGES:
+        shutil.copytree(ROOT / package, source / package, ignore=ignored)
+    for path in (*ROOT.glob("*.py"), *(ROOT / name for name in ("py.typed", "pyproject.toml", "README.md"))):
+        shutil.copy(path, source)
+    for name in ("LICENSE", "NOTICE"):
+        shutil.copy(ROOT / name, source)
+    build = "import sys; from setuptools.build_meta import build_wheel; build_wheel(sys.argv[1])"
+    subprocess.run([sys.executable, "-c", build, tmp_path], cwd=source, check=True, capture_output=True, timeout=120)
+    (wheel,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        wheel_files = {name for name in archive.namelist() if name.startswith("idesplat/")}
+    sources = (path for package in PACKAGES for path in (source / package).rglob("*") if path.is_file())
+    expected = {f"idesplat/{path.relative_to(source).as_posix()}" for path in (*sources, *source.glob("*.py"))}
+    assert wheel_files == expected | {"idesplat/py.typed"}
 
 
 def test_nothing_generic_becomes_importable(tmp_path: Path) -> None:
