@@ -21,8 +21,7 @@ def main() -> None:
     print(f"{len(gaussians.means)} Gaussians, depth maps {reconstruction.depth.shape}")
     idesplat.write_splats(out / "scene.ply", gaussians)
 
-    camera = reconstruction.cameras[0]
-    rendering = idesplat.render(gaussians, [camera])[0]
+    rendering = next(idesplat.render(gaussians, reconstruction.cameras))  # one view at a time
     Image.fromarray((rendering.rgb.clip(0, 1) * 255).round().astype(np.uint8)).save(out / "view.png")
 
 
