@@ -15,14 +15,14 @@ HALF_WIDTH, HALF_HEIGHT, BACK = 5.0, 3.0, 16.0
 SPHERES = ((-1.2, 0.8, 5.0, 1.0), (1.6, 1.4, 7.0, 1.5), (0.3, -0.6, 10.0, 1.2))
 LIGHT = (0.4, -0.8, -0.45)
 AMBIENT = 0.4
-# Texture: waves of random direction, mostly grey, whose amplitude falls with the frequency, as in photographs.
+# Texture: waves of random direction, mostly grey, whose amplitude falls with the frequency, as in natural images.
 WAVES, LOWEST_FREQUENCY, HIGHEST_FREQUENCY = 48, 0.4, 24.0  # radians in a unit
 CONTRAST, COLOURFULNESS, DECAY = 0.12, 0.35, 0.5
 LEVELS = 255  # of an image file
 
 
 def room_inputs(views: int, height: int, width: int, near: float, far: float) -> dict[str, Tensor]:
-    """The cameras of `example_inputs` in the room."""
+    """The cameras of `example_inputs`, with images of the room."""
     return with_room(example_inputs(views, height, width, near, far), near)
 
 
@@ -46,7 +46,7 @@ def _render(pose: np.ndarray, intrinsics: np.ndarray, height: int, width: int, u
 
 
 def _first_hits(origin: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where rays [h, w, 3] from a point in the room meet it first, and the surface's normals there."""
+    """First intersections of rays [h, w, 3] from a point in the room with its surfaces, and the normals there."""
     walls = np.array([HALF_WIDTH, HALF_HEIGHT, BACK])
     with np.errstate(divide="ignore", invalid="ignore"):
         distances = (np.sign(rays) * walls - origin) / rays
@@ -79,7 +79,10 @@ def _texture(points: np.ndarray) -> np.ndarray:
 
 
 def example_inputs(views: int, height: int, width: int, near: float, far: float) -> dict[str, Tensor]:
-    """Cameras on an arc before a textured scene, and pictures of noise at several scales: every part has work to do."""
+    """Cameras on an arc, and images of noise at several scales, by the names of `INPUTS`.
+
+    views, height, width: of the images. near, far: the depth range, in scene units.
+    """
     generator = torch.Generator().manual_seed(views)
     images = torch.zeros(views, 3, height, width)
     for size in (2, 4, 8, 16):

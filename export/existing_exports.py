@@ -1,7 +1,7 @@
-"""What idesplat-export has written: how its graphs and staged folders are known, and replaced without a moment's gap.
+"""Existing exports: how graphs and staged folders of idesplat-export are recognised, and replaced atomically.
 
-A staged folder is replaced by exchanging it with the new one, which systems do in one step; where they cannot, the old
-one steps aside first, and a run that was killed between the two steps is made good by the next (`working_folder`).
+A staged folder is exchanged with the new one in one step where the system supports that. Elsewhere the old folder is
+moved aside first; if a run is killed between the two steps, the next one restores it (`working_folder`).
 """
 
 import ctypes
@@ -25,9 +25,9 @@ from ..runtime.inference.metadata import MANIFEST_NAME, METADATA_KEY
 STAGED_FORMAT = "idesplat-staged"
 LARGEST_MANIFEST = 1 << 20  # bytes
 LARGEST_GRAPH = 1 << 31  # bytes; Protobuf reads no larger message
-# Folders that are worked in, beside what they are to become. Its process holds a lock on the file.
+# Working folders, beside their results. The process holds a lock on the file.
 WORKING_PREFIX, LOCK = ".idesplat-export.", "lock"
-# In a working folder, what stood in the place of a new folder of the name that follows.
+# In a working folder: prefix of the folder that a new one replaced; its name follows.
 PREVIOUS = "previous."
 # Of Linux's renameat2 and of macOS's renamex_np.
 RENAME_EXCHANGE, RENAME_SWAP, AT_FDCWD = 2, 2, -100
@@ -49,9 +49,9 @@ def weights_beside(path: Path) -> set[str]:
 
 
 def foreign_entries(folder: Path) -> list[str]:
-    """What a folder holds that is not of a staged export: all but its manifest and the graphs and weights it names.
+    """The entries of a folder that are no part of a staged export: all but its manifest, graphs and weights.
 
-    Everything in it, if the manifest is not one of `idesplat-export --staged`.
+    All entries, if the manifest is not one of `idesplat-export --staged`.
     """
     own = {MANIFEST_NAME, *_staged_files(folder)}
     own |= {name for file in own for name in weights_beside(folder / file)}
@@ -60,10 +60,10 @@ def foreign_entries(folder: Path) -> list[str]:
 
 
 def replace_folder(new: Path, folder: Path) -> None:
-    """Put a new folder, in a working folder beside it, in the place of a staged folder, an empty or no folder.
+    """Move a new folder to where a staged, an empty or no folder is; what was there is moved to the working folder.
 
-    What was there is then in the working folder.
-    Raises InputError, with the old folder in its place, if it holds anything that is not of a staged export.
+    new: in a working folder beside it. Raises InputError, with the old folder in its place, if that holds anything that
+    is no part of a staged export.
     """
     try:
         if not folder.exists() or not any(folder.iterdir()):
@@ -82,12 +82,12 @@ def replace_folder(new: Path, folder: Path) -> None:
 
 
 def check_replaceable(folder: Path) -> None:
-    """Raise InputError if a folder holds anything that is not of a staged export."""
+    """Raise InputError if a folder holds anything that is no part of a staged export."""
     _check_replaceable(folder, folder)
 
 
 def _check_replaceable(at: Path, folder: Path, undo: Callable[[], object] = lambda: None) -> None:
-    """Raise InputError, after `undo`, if the old content of a folder, which is now elsewhere, is not to be lost."""
+    """Raise InputError, after `undo`, if a folder's old content, which is now at `at`, must be kept."""
     foreign = foreign_entries(at)
     if foreign:
         undo()
@@ -99,7 +99,7 @@ def _check_replaceable(at: Path, folder: Path, undo: Callable[[], object] = lamb
 
 @contextmanager
 def working_folder(parent: Path) -> Iterator[Path]:
-    """A folder to work in, beside what is made in it; it is removed afterwards, and so are those of killed runs."""
+    """A working folder, beside the results; it is removed afterwards, and so are those of killed runs."""
     with suppress(OSError):
         _clean_up(parent)
     temporary = tempfile.TemporaryDirectory(prefix=WORKING_PREFIX, dir=parent, ignore_cleanup_errors=True)
@@ -108,7 +108,7 @@ def working_folder(parent: Path) -> Iterator[Path]:
 
 
 def _clean_up(parent: Path) -> None:
-    """Remove the working folders of killed runs, and put back a folder that one of them had moved aside."""
+    """Remove the working folders of killed runs, and restore a folder that one of them had moved aside."""
     for left in parent.glob(f"{WORKING_PREFIX}*"):
         lock = _lock(left / LOCK, os.O_RDWR)
         if lock is None:
@@ -125,7 +125,7 @@ def _clean_up(parent: Path) -> None:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Hold the lock of a working folder, which has one from the moment on at which it has the file."""
+    """Hold the lock of a working folder; the lock file appears only once it is locked."""
     unnamed = folder / f"{LOCK}.new"
     lock = _lock(unnamed, os.O_RDWR | os.O_CREAT)
     unnamed.rename(folder / LOCK)

@@ -1,7 +1,7 @@
-"""The stages and the tensors that pass between them, under the names that classes, files, manifest and report share.
+"""The stages of a network and the tensors between them, by the names that classes, files, manifest and report share.
 
-A stage is an attribute of the network; `encoder.features_mv` is a field of what the stage `encoder` yields. Which of
-them a later stage reads is not written down anywhere: it is read off the traced graph, and so cannot go stale.
+A stage is a child module of the network; `encoder.features_mv` is a field of what the stage `encoder` returns. Which of
+these a later stage reads is determined from the traced graph.
 """
 
 from dataclasses import dataclass
@@ -38,12 +38,15 @@ class NamedTensors(nn.Module):
         return tuple(self.named(*inputs).values())
 
     def named(self, *inputs: Tensor) -> dict[str, Tensor]:
-        """The fields of every stage before the last, and the network's own outputs."""
+        """The fields that every stage before the last returns, and the network's outputs."""
         return self.model.named_tensors(*inputs)
 
 
 def find_stages(traced: onnx.ModelProto, names: list[str]) -> list[Stage]:
-    """The stages of a traced graph in the order in which they run, each with what it reads and what is read of it."""
+    """The stages of a traced graph in the order in which they run, each with the tensors that it reads and provides.
+
+    names: of the stages, in order. Outputs that no later stage reads are left out.
+    """
     named = [output.name for output in traced.graph.output]
     results = [name for name in named if "." not in name]  # the last stage's
     needed, stages = set(results), []
@@ -58,7 +61,7 @@ def find_stages(traced: onnx.ModelProto, names: list[str]) -> list[Stage]:
 
 
 def stage_graph(traced: onnx.ModelProto, stage: Stage) -> onnx.ModelProto:
-    """The part of a traced graph that a stage is, as a graph of its own."""
+    """A stage's sub-graph of a traced graph, as a graph of its own."""
     nodes, _ = extract_subgraph(traced, set(stage.inputs), stage.outputs)
     read = {name for node in nodes for name in names_read(node)} | set(stage.outputs)
     values = {value.name: value for value in (*traced.graph.input, *traced.graph.output)}

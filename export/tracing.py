@@ -1,4 +1,4 @@
-"""Freeze a network: one trace to one ONNX graph, from which the stages' graphs are cut."""
+"""Trace a network once to one ONNX graph, and split it into the stages' graphs."""
 
 import copy
 import logging
@@ -21,7 +21,7 @@ from .stages import NamedTensors, Stage, find_stages, stage_graph
 
 OPSET = 20
 IR_VERSION = 10
-# Traced with views and sizes that no other number in the network equals; the graph is dynamic in all three.
+# Numbers of views and blocks that differ from every constant in the network; the graph is dynamic in all of them.
 TRACE_VIEWS = 4
 TRACE_BLOCKS = (6, 8)
 DYNAMIC = {
@@ -34,13 +34,13 @@ DYNAMIC = {
     **{name: {0: "gaussians"} for name in OUTPUTS if name != "depth"},
 }
 PRODUCER = "idesplat"
-# Files of the folder that is worked in.
+# Files of the working folder.
 TRACED, TRACED_WEIGHTS, WEIGHTS, WHOLE = "traced.onnx", "traced.weights", "weights", "whole.onnx"
 
 
 @dataclass(frozen=True)
 class StaticShape:
-    """Sizes to bake in; None leaves them to the user of the graph."""
+    """Dimensions that are constants of the graph; None keeps them dynamic. size: height and width."""
 
     views: int | None = None
     size: tuple[int, int] | None = None
@@ -48,64 +48,64 @@ class StaticShape:
 
 @dataclass(frozen=True)
 class Graphs:
-    """A frozen network: the whole and every stage as files in one folder, where all their weights are one more file."""
+    """The graphs of a traced network, whole and by stage, as files in one folder with one file of weights for all."""
 
     folder: Path
     stages: list[Stage]
-    # Nodes of the whole.
+    # Of the whole graph.
     nodes: int
 
     @property
     def whole(self) -> Path:
-        """The graph with the network's own outputs alone."""
+        """The graph with only the network's outputs."""
         return self.folder / WHOLE
 
     @property
     def bytes(self) -> int:
-        """How large the whole is with its weights."""
+        """The size of the whole graph with its weights."""
         return self.whole.stat().st_size + (self.folder / WEIGHTS).stat().st_size
 
     def of_stage(self, stage: Stage) -> Path:
-        """The graph between a stage's named tensors."""
+        """The graph of a stage."""
         return self.folder / f"stage.{stage.name}.onnx"
 
 
-def export_graphs(network: NamedTensors, description: ModelMetadata, static: StaticShape, folder: Path) -> Graphs:
-    """Trace a network and cut it into stages, all as files in an empty folder, checked against ONNX's specification."""
-    traced = trace(network, description, static, folder)
-    layers, examples = network.family.quantizable, _examples(description, static)
-    traced = convert_precision(description.precision, traced, folder / WEIGHTS, layers, examples)
+def export_graphs(network: NamedTensors, metadata: ModelMetadata, static: StaticShape, folder: Path) -> Graphs:
+    """Trace a network and split it into stages: files in an empty folder, checked by ONNX's checker."""
+    traced = trace(network, metadata, static, folder)
+    layers, examples = network.family.quantizable, _examples(metadata, static)
+    traced = convert_precision(metadata.precision, traced, folder / WEIGHTS, layers, examples)
     whole = _whole_graph(traced)
     graphs = Graphs(folder, find_stages(traced, network.stages), len(whole.graph.node))
-    _write(whole, description, graphs.whole)
+    _write(whole, metadata, graphs.whole)
     for stage in graphs.stages:
-        _write(stage_graph(traced, stage), description, graphs.of_stage(stage))
+        _write(stage_graph(traced, stage), metadata, graphs.of_stage(stage))
     return graphs
 
 
-def _examples(description: ModelMetadata, static: StaticShape) -> Iterator[Feeds]:
-    """Noise and a room, upright and across, to see what ranges a network's numbers have."""
-    across = tuple(blocks * description.size_multiple for blocks in TRACE_BLOCKS)
+def _examples(metadata: ModelMetadata, static: StaticShape) -> Iterator[Feeds]:
+    """Calibration inputs: noise and a synthetic room, in portrait and landscape format."""
+    across = tuple(blocks * metadata.size_multiple for blocks in TRACE_BLOCKS)
     for height, width in [static.size] if static.size else [across, across[::-1]]:
         for make in (example_inputs, room_inputs):
-            inputs = make(static.views or TRACE_VIEWS, height, width, description.near, description.far)
+            inputs = make(static.views or TRACE_VIEWS, height, width, metadata.near, metadata.far)
             yield {name: tensor.numpy() for name, tensor in inputs.items()}
 
 
-def trace(network: NamedTensors, description: ModelMetadata, static: StaticShape, folder: Path) -> onnx.ModelProto:
-    """Export the network with every stage boundary as an output; its weights go to a file in the folder.
+def trace(network: NamedTensors, metadata: ModelMetadata, static: StaticShape, folder: Path) -> onnx.ModelProto:
+    """Trace the network with every tensor between stages as an output; its weights go to a file in the folder.
 
-    torch.onnx's TorchScript path is used on purpose: with views, height and width dynamic, torch.export 2.13 spends
-    minutes reasoning about symbolic shapes even for a network of a tenth of the size. It is not given the weights,
-    of which it would hold several copies.
+    torch.onnx's TorchScript exporter is used because with dynamic views, height and width torch.export 2.13 spends
+    minutes on symbolic shapes, even for a network of a tenth of the size. The exporter is not given the weights, of
+    which it would hold several copies.
     """
-    multiple = description.size_multiple
+    multiple = metadata.size_multiple
     views = static.views or TRACE_VIEWS
     height, width = static.size or (TRACE_BLOCKS[0] * multiple, TRACE_BLOCKS[1] * multiple)
-    inputs = tuple(example_inputs(views, height, width, description.near, description.far).values())
+    inputs = tuple(example_inputs(views, height, width, metadata.near, metadata.far).values())
     path, weights = folder / TRACED, folder / TRACED_WEIGHTS
     with warnings.catch_warnings(), torch.no_grad(), chunked(network):
-        warnings.simplefilter("ignore")  # deprecation of the path, and tracing warnings on sizes fixed on purpose
+        warnings.simplefilter("ignore")  # the exporter's deprecation, and tracing warnings about static dimensions
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)
         shapes = {name: tuple(tensor.shape) for name, tensor in network.named(*inputs).items()}
         axes = _dynamic_axes(shapes, static)
@@ -115,7 +115,7 @@ def trace(network: NamedTensors, description: ModelMetadata, static: StaticShape
             str(path),
             dynamo=False,
             export_params=False,
-            do_constant_folding=False,  # weights that it folds lose their names; `simplify` folds them
+            do_constant_folding=False,  # folded weights lose their names; `simplify` folds them later
             opset_version=OPSET,
             input_names=list(INPUTS),
             output_names=list(shapes),
@@ -131,7 +131,7 @@ def trace(network: NamedTensors, description: ModelMetadata, static: StaticShape
 
 
 def _dynamic_axes(shapes: dict[str, tuple[int, ...]], static: StaticShape) -> dict[str, dict[int, str]]:
-    """Names of the dimensions that are not fixed; the maps between stages have dimensions of their own."""
+    """Names of the dynamic dimensions by tensor and axis; maps between stages have names of their own."""
     boundaries = {
         name: {0: "views", 2: f"{name}.height", 3: f"{name}.width"}
         if len(shape) == 4
@@ -140,19 +140,19 @@ def _dynamic_axes(shapes: dict[str, tuple[int, ...]], static: StaticShape) -> di
         if "." in name
     }
 
-    def is_open(dimension: str) -> bool:
+    def is_dynamic(dimension: str) -> bool:
         depends_on_views = dimension in ("views", "neighbours", "gaussians")
         depends_on_size = dimension == "gaussians" or not depends_on_views
         return (depends_on_views and not static.views) or (depends_on_size and not static.size)
 
     axes = {**DYNAMIC, **boundaries}
-    return {name: {axis: dim for axis, dim in dims.items() if is_open(dim)} for name, dims in axes.items()}
+    return {name: {axis: dim for axis, dim in dims.items() if is_dynamic(dim)} for name, dims in axes.items()}
 
 
 def _declare_shapes(
     model: onnx.ModelProto, shapes: dict[str, tuple[int, ...]], axes: dict[str, dict[int, str]]
 ) -> None:
-    """Give every output the shape that is known of it: the passes above replace names by ones of their own."""
+    """Restore the outputs' dimension names, which the simplification replaces."""
     for output in model.graph.output:
         dims = [axes[output.name].get(axis, size) for axis, size in enumerate(shapes[output.name])]
         element = output.type.tensor_type.elem_type
@@ -167,12 +167,12 @@ def _whole_graph(traced: onnx.ModelProto) -> onnx.ModelProto:
     return model
 
 
-def _write(model: onnx.ModelProto, description: ModelMetadata, path: Path) -> None:
-    """Have a graph say what it is, and save it."""
+def _write(model: onnx.ModelProto, metadata: ModelMetadata, path: Path) -> None:
+    """Add the metadata to a graph, and save and check it."""
     model.ir_version = IR_VERSION
-    model.producer_name, model.producer_version = PRODUCER, description.version
-    model.doc_string = f"{description.preset} exported by idesplat {description.version}"
+    model.producer_name, model.producer_version = PRODUCER, metadata.version
+    model.doc_string = f"{metadata.preset} exported by idesplat {metadata.version}"
     del model.metadata_props[:]
-    onnx.helper.set_model_props(model, {METADATA_KEY: description.to_json()})
+    onnx.helper.set_model_props(model, {METADATA_KEY: metadata.to_json()})
     path.write_bytes(model.SerializeToString())
     onnx.checker.check_model(str(path), full_check=True)

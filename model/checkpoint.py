@@ -1,4 +1,7 @@
-"""Strict loading of released checkpoints: every key and every shape, or an error that names what differs."""
+"""Strict and safe loading of checkpoints: every key and every shape, or an error that names what differs.
+
+Reading is the same for every network; each family renames the keys of its releases (`Family.rename_released`).
+"""
 
 import functools
 import hashlib
@@ -20,15 +23,15 @@ from .registry import FAMILIES, PRESETS, build, family_of
 CONTAINERS = ("state_dict", "model")
 # Released files name the first digits of their SHA-256.
 NAMED_HASH = re.compile(r"-([0-9a-f]{8})\.pth$")
-# Keys an error message shows before it only counts, and the most characters of a key or a reason that it shows.
+# Limits of an error message: keys that are named, the others are counted, and characters of a key or a reason.
 SHOWN = 4
 LONGEST_SHOWN = 100
-# What weights may be stored in; they are used in float32.
+# Types in which weights may be stored; they are converted to float32.
 FLOATS = (torch.float32, torch.float16, torch.bfloat16, torch.float64)
 
 
 class CheckpointError(ValueError):
-    """A checkpoint that cannot be used; the message names the file, what is wrong and what to do."""
+    """A checkpoint that cannot be used; the message names the file, what is wrong and the remedy."""
 
 
 def load_checkpoint(path: Path, preset: str | EncoderConfig | None = None) -> Network:
@@ -47,7 +50,7 @@ def load_checkpoint(path: Path, preset: str | EncoderConfig | None = None) -> Ne
 def read_state_dict(path: Path) -> dict[str, Tensor]:
     """The tensors of a checkpoint file by the names in the file, without running code that the file may hold.
 
-    Raises CheckpointError; also for tensors that are no plain arrays on the CPU.
+    Raises CheckpointError if the file is unsafe or unreadable, or holds tensors that are not dense or have no values.
     """
     _check_file(path)
     with warnings.catch_warnings():
@@ -80,7 +83,7 @@ def _text(path: Path, key: object) -> str:
 
 
 def _plain(path: Path, key: str, value: Tensor) -> Tensor:
-    """A tensor without attributes or gradient; raises CheckpointError unless it is a plain array on the CPU."""
+    """A tensor without attributes or gradient; raises CheckpointError unless it is dense and has values."""
     kinds = {
         "sparse": value.layout is not torch.strided,
         "nested": value.is_nested,
@@ -96,7 +99,7 @@ def _plain(path: Path, key: str, value: Tensor) -> Tensor:
 
 
 def _shown_text(text: str) -> str:
-    """Something of a file as an error message may show it: short, in one line, without control characters."""
+    """Text from a file for an error message: short, in one line, without control characters."""
     text = text if text.isprintable() and text.isascii() else ascii(text)
     return text if len(text) <= LONGEST_SHOWN else text[:LONGEST_SHOWN] + "..."
 
@@ -112,7 +115,7 @@ def file_sha256(path: Path) -> str:
 
 
 def name_hash_warning(path: Path, digest: str) -> str | None:
-    """A warning, if the file's name holds the beginning of its SHA-256, as released ones do, and it does not match."""
+    """A warning if the file's name holds the beginning of a SHA-256, as released names do, and it is not the file's."""
     named = NAMED_HASH.search(path.name)
     if not named or digest.startswith(named[1]):
         return None
@@ -141,7 +144,7 @@ def _read_safetensors(path: Path) -> object:
 
 
 def _read_pickle(path: Path) -> object:
-    """What torch.save wrote; only tensors and plain containers are rebuilt, whatever the pickle asks for."""
+    """The content of a file of torch.save; only tensors and plain containers are unpickled."""
     _check_archive(path)
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
@@ -157,12 +160,12 @@ def _read_pickle(path: Path) -> object:
 
 
 def _check_archive(path: Path) -> None:
-    """Refuse an archive whose entries claim more bytes than the file has: torch.save neither packs nor shares them."""
+    """Refuse an archive whose entries claim more bytes than the file has: torch.save does not compress."""
     try:
         with zipfile.ZipFile(path) as archive:
             claimed = sum(entry.file_size for entry in archive.infolist())
     except (OSError, ValueError, NotImplementedError, zipfile.BadZipFile, struct.error):
-        return  # no archive, as PyTorch's older format is none, or a damaged one, which torch.load refuses
+        return  # PyTorch's older format, which is no archive, or a damaged archive, which torch.load refuses
     if claimed > path.stat().st_size:
         raise CheckpointError(
             f"{path}: claims to hold {claimed} bytes in a file of {path.stat().st_size}, expected an archive as "
@@ -235,7 +238,7 @@ def fill(model: Network, tensors: dict[str, Tensor], path: Path) -> None:
 
 
 def _check_values(tensors: dict[str, Tensor], path: Path) -> None:
-    """Refuse weights, whose shapes are known to fit, that are no numbers to compute with."""
+    """Refuse weights that are not floating-point or not finite."""
     integers = [f"{key} holds {value.dtype}" for key, value in tensors.items() if value.dtype not in FLOATS]
     if integers:
         raise CheckpointError(
@@ -255,7 +258,7 @@ def _expected_shapes(config: EncoderConfig) -> dict[str, tuple[int, ...]]:
 
 
 def _differences(expected: dict[str, tuple[int, ...]], tensors: dict[str, Tensor]) -> list[str]:
-    """What differs, in words: missing keys, keys unknown, shapes."""
+    """Messages of what differs: missing keys, shapes, unknown keys."""
     missing = [f"{key} is missing" for key in expected if key not in tensors]
     unknown = [f"{_shown_text(key)} is unknown" for key in tensors if key not in expected]
     shapes = [

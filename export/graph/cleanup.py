@@ -1,4 +1,4 @@
-"""Clean a traced graph without leaving standard ONNX."""
+"""Simplification of a traced graph within standard ONNX."""
 
 from pathlib import Path
 
@@ -10,9 +10,9 @@ EXTERNAL_FILE = "session.optimized_model_external_initializers_file_name"
 
 
 def simplify(path: Path, weights: Path) -> onnx.ModelProto:
-    """Fold constants and merge equal nodes with ONNX Runtime's hardware-independent passes; halves the nodes.
+    """Fold constants and merge equal nodes with ONNX Runtime's hardware-independent passes; this halves the nodes.
 
-    The result's weights go to the file `weights`, which is to lie in the graph's folder.
+    weights: the file for the result's weights, in the graph's folder.
     """
     options = onnxruntime.SessionOptions()
     options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC

@@ -1,4 +1,4 @@
-"""Weights in a file beside a graph, so that graphs are cut, checked and run without a copy of the weights in memory."""
+"""Graphs with external weights: split, checked and run without a copy of the weights in memory."""
 
 import hashlib
 from collections.abc import Iterable, Iterator
@@ -11,14 +11,14 @@ from torch import Tensor
 from ...runtime.errors import InputError
 from ..existing_exports import is_our_graph, weights_beside
 
-# Protobuf reads no message of 2 GiB or more, so a larger model keeps its weights beside it when it is handed out, too.
+# Protobuf reads no message of 2 GiB or more, so the weights of a larger model are written to a file of their own.
 LARGEST_FILE = 2_000_000_000
 BESIDE = ".data"
 DIGITS = 16  # of its SHA-256 in the name of a file of weights
 
 
 def fill_inputs(model: onnx.ModelProto, weights: Iterable[tuple[str, Tensor]], path: Path) -> None:
-    """Make initialisers of the graph's inputs that weights are named after, their values in a new file at `path`."""
+    """Turn the graph's inputs of these names into initialisers, with the values in a new file at `path`."""
     inputs = {value.name: value for value in model.graph.input}
     with path.open("wb") as file:
         for name, weight in weights:
@@ -32,10 +32,10 @@ def fill_inputs(model: onnx.ModelProto, weights: Iterable[tuple[str, Tensor]], p
 
 
 def save_model(graph: Path, out: Path) -> list[Path]:
-    """Write a graph whose weights lie beside it to a new file, which then holds them unless that makes it too large.
+    """Write a graph with external weights to a new file that holds the weights, too, unless that makes it too large.
 
-    Returns the paths written. What cannot stay together is `out` and a file that is to be moved along with it; that one
-    is named after its content.
+    Returns the paths written: `out` and, for a large model, the file of its weights, which is named after its content
+    and must stay in the same folder.
     """
     model = onnx.load(graph, load_external_data=False)
     size = model.ByteSize() + sum(ExternalDataInfo(tensor).length or 0 for tensor in _outside(model))
@@ -62,9 +62,9 @@ def save_model(graph: Path, out: Path) -> list[Path]:
 
 
 def check_weights(graph: Path, written: Path) -> None:
-    """Raise InputError unless a graph that `save_model` wrote holds the weights of the one that it was written from.
+    """Raise InputError unless a graph that `save_model` wrote holds the same weights as its source.
 
-    Outputs alone would not show a damaged weight that has little effect on the cases of the verification.
+    Outputs alone would not show a damaged weight that has little effect in the verification cases.
     """
     found, expected = (
         {
@@ -85,10 +85,10 @@ def _digest(tensor: onnx.TensorProto, folder: Path) -> bytes:
 
 
 def publish(files: list[Path], folder: Path) -> list[Path]:
-    """Move what `save_model` wrote into a folder of the same file system, over any graph of that name; their new paths.
+    """Move the files of `save_model` into a folder of the same file system, over a graph of that name; their paths.
 
-    A run that is killed on the way leaves the old graph with its weights or the new one with its own: weights come
-    first, under a name of their own, and those of the graph that was replaced go last.
+    If the run is killed meanwhile, the old graph with its weights remains, or the new one with its own: new weights
+    are moved first, under a name of their own, and the weights of the replaced graph are removed last.
     Raises InputError if the folder cannot be written.
     """
     graph = folder / files[0].name
@@ -112,7 +112,7 @@ def _name_beside(graph: str, digest: str) -> str:
 
 
 def _is_of(path: Path, graph: str) -> bool:
-    """Whether a file holds weights that a run wrote for a graph of this name: its own name proves its content."""
+    """Whether a file holds weights that a run wrote for a graph of this name: its name has the hash of its content."""
     if not (path.name.startswith(f"{graph}.") and path.name.endswith(BESIDE) and path.is_file()):
         return False
     if len(path.name) != len(_name_beside(graph, "0" * DIGITS)):
@@ -133,7 +133,7 @@ def _values(tensor: onnx.TensorProto, folder: Path) -> bytes:
 
 
 def _refer(tensor: onnx.TensorProto, location: str, offset: int, length: int) -> None:
-    """Say that a tensor's values are in another file, which is found in the graph's own folder wherever that is."""
+    """Refer a tensor's values to another file, relative to the graph's folder."""
     tensor.data_location = onnx.TensorProto.EXTERNAL
     tensor.ClearField("external_data")
     for key, value in (("location", location), ("offset", offset), ("length", length)):

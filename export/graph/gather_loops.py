@@ -1,9 +1,9 @@
-"""The sparse products of epipolar attention as ONNX runs them fastest: a few pixels at a time, by a Loop.
+"""Gather attention in ONNX, chunked: an ONNX Loop over a few pixels at a time.
 
-A pixel's candidates fall on some hundred rows of features. Gathered for all pixels at once they fill gigabytes, which
-go through memory three times. Gathered for a few pixels they stay in a processor's cache, where a product of matrices
-uses them up; a Loop does so in one node, whatever the size of the images. (A Scan is as fast, but OpenVINO refuses one
-whose steps read a tensor from around it, as the table is.)
+A pixel gathers some hundred rows of features. Gathered for all pixels at once they fill gigabytes, which pass through
+memory three times. Gathered for a few pixels they stay in the CPU's cache, where a MatMul consumes them. A Loop is one
+node, whatever the image size. (A Scan is as fast, but OpenVINO refuses one whose body reads a tensor from outside, as
+the table is.)
 """
 
 from collections.abc import Iterator
@@ -18,13 +18,13 @@ from torch import Tensor, nn
 
 from ...model.common.gather_attention import GatherAttention, gathered_dot, gathered_weighted_sum
 
-# With fewer numbers than this to gather for a pixel, the steps cost more than they save.
+# With fewer values than this to gather a pixel, the loop costs more than it saves.
 FEW = 256
-# While a network is traced each product is one node of this domain; these functions say what it does.
+# While a network is traced, each operation is one node of this domain, defined by the functions below.
 DOMAIN = "idesplat"
-# What both products share: rows [pairs, candidates, h * w], table [rows, channels] and `by_pixel` [pairs, h * w, ...]
-# -> products [steps, step, ...], of a step's pixels, each of `shape`, with the rows that they gather. A step takes a
-# block: 16 pixels in the releases' coarsest maps, where they gather most, 256 in the finest.
+# What both operations share: rows [pairs, candidates, h * w], table [rows, channels] and `by_pixel` [pairs, h * w, ...]
+# -> products [steps, step, ...] of the pixels of each step, reshaped to `shape`, with the rows that they gather. A step
+# takes a block: 16 pixels in the releases' coarsest maps, which gather most, 256 in the finest.
 STEPS = """
         candidates = Shape <start = 1, end = 2> (rows)
         pixels = Shape <start = 2, end = 3> (rows)
@@ -67,25 +67,25 @@ FUNCTIONS = tuple(
 
 @contextmanager
 def chunked(network: nn.Module) -> Iterator[None]:
-    """Have a network's sparse products traced as nodes that `lower_custom_ops` explains."""
-    parts = [part for part in network.modules() if isinstance(part, GatherAttention) and part.gathers >= FEW]
-    for part in parts:
+    """Within this context, a network's gather attention is traced as custom nodes, for `lower_custom_ops`."""
+    modules = [part for part in network.modules() if isinstance(part, GatherAttention) and part.gathers >= FEW]
+    for part in modules:
         part.gathered_dot = partial(_GatheredDot.apply, part.block)
         part.gathered_weighted_sum = partial(_GatheredWeightedSum.apply, part.block)
     try:
         yield
     finally:
-        for part in parts:
+        for part in modules:
             part.gathered_dot, part.gathered_weighted_sum = gathered_dot, gathered_weighted_sum
 
 
 def lower_custom_ops(traced: onnx.ModelProto) -> onnx.ModelProto:
-    """The graph with standard operators in place of the nodes that `chunked` left, and named after them."""
+    """The graph with standard operators in place of the custom nodes of `chunked`, named after these."""
     products = {node.output[0]: node.name for node in traced.graph.node if node.domain == DOMAIN}
     traced.functions.extend(onnx.parser.parse_function(function) for function in FUNCTIONS)
     model = onnx.inliner.inline_local_functions(traced)
     name = ""
-    for node in reversed(model.graph.node):  # a product's result is the last of its nodes
+    for node in reversed(model.graph.node):  # the output is that of the last of a function's nodes
         name = products.get(node.output[0], name)
         if not node.name:
             _name(node, name)
@@ -93,7 +93,7 @@ def lower_custom_ops(traced: onnx.ModelProto) -> onnx.ModelProto:
 
 
 def _name(node: onnx.NodeProto, scope: str) -> None:
-    """Name a node, and what is inside it."""
+    """Name a node, and the nodes of its sub-graphs."""
     node.name = f"{scope}/{node.output[0]}"
     for attribute in node.attribute:
         for inner in attribute.g.node:

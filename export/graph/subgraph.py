@@ -1,4 +1,4 @@
-"""The nodes of a graph: what they read, which lie between tensors, others in their place, their order."""
+"""Sub-graphs and node lists: extraction between tensors, replacement, topological order."""
 
 from collections.abc import Iterable
 from graphlib import TopologicalSorter
@@ -9,21 +9,21 @@ import onnx
 def extract_subgraph(
     traced: onnx.ModelProto, borders: set[str], outputs: Iterable[str]
 ) -> tuple[list[onnx.NodeProto], set[str]]:
-    """The nodes on every way back from `outputs` to the first border tensors, in their order, and those tensors."""
+    """The nodes between border tensors and `outputs`, in graph order, and the border tensors that they read."""
     producers = {output: index for index, node in enumerate(traced.graph.node) for output in node.output}
-    met, found, open_names = set(), set(), list(outputs)
-    while open_names:
-        name = open_names.pop()
+    met, found, pending = set(), set(), list(outputs)
+    while pending:
+        name = pending.pop()
         if name in borders:
             met.add(name)
         elif name in producers and producers[name] not in found:
             found.add(producers[name])
-            open_names.extend(names_read(traced.graph.node[producers[name]]))
+            pending.extend(names_read(traced.graph.node[producers[name]]))
     return [traced.graph.node[index] for index in sorted(found)], met
 
 
 def names_read(node: onnx.NodeProto) -> set[str]:
-    """The tensors that a node reads, those included that the graphs inside it take from around it."""
+    """The tensors that a node reads, including those that its sub-graphs read from outside."""
     read = set(node.input)
     for attribute in node.attribute:
         if attribute.type == onnx.AttributeProto.GRAPH:
@@ -35,7 +35,7 @@ def names_read(node: onnx.NodeProto) -> set[str]:
 
 
 def replace_nodes(graph: onnx.GraphProto, nodes: list[onnx.NodeProto]) -> None:
-    """Give a graph other nodes, without those and the weights whose result nobody reads."""
+    """Replace a graph's nodes, and remove nodes and weights that nothing reads."""
     read = {name for node in nodes for name in names_read(node)} | {output.name for output in graph.output}
     kept = [weight for weight in graph.initializer if weight.name in read]
     del graph.node[:], graph.initializer[:]
@@ -44,7 +44,7 @@ def replace_nodes(graph: onnx.GraphProto, nodes: list[onnx.NodeProto]) -> None:
 
 
 def sort_nodes(graph: onnx.GraphProto) -> None:
-    """Put nodes after those whose results they read: ONNX Runtime's tools forget what is read inside a Loop."""
+    """Sort nodes topologically: ONNX Runtime's tools ignore what is read inside a Loop."""
     producers = {name: index for index, node in enumerate(graph.node) for name in node.output}
     needed = {
         index: {producers[name] for name in names_read(node) if name in producers}

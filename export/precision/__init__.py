@@ -1,1 +1,1 @@
-"""Lower precisions: int8 and fp16."""
+"""Conversion to lower precisions: int8 and fp16."""

@@ -15,7 +15,7 @@ from .fp16 import in_fp16
 from .int8 import Feeds, in_int8
 
 FLOAT32, INT8, FP16 = PRECISIONS = ("float32", "int8", "fp16")
-# Tensors smaller than this stay in the graph's file.
+# Smaller tensors stay in the graph's file.
 SMALL_TENSOR = 1024  # bytes
 
 

@@ -1,6 +1,6 @@
-"""Products of features in fp16, with casts around them, so that all else stays in float32.
+"""Conversion of chosen nodes to fp16, with casts around them; all others stay in float32.
 
-(The converter of onnxruntime.transformers rounds the graph's inputs, and cameras do not bear that.)
+(The converter of onnxruntime.transformers rounds the graph's inputs, too, and cameras do not tolerate that.)
 """
 
 import numpy as np
@@ -10,7 +10,7 @@ from ..graph.subgraph import replace_nodes
 
 
 def in_fp16(model: onnx.ModelProto, names: set[str]) -> onnx.ModelProto:
-    """The graph, loaded with its weights, where the nodes of these names are in fp16."""
+    """A graph that is loaded with its weights, with the nodes of these names in fp16."""
     weights = {tensor.name: tensor for tensor in model.graph.initializer}
     nodes: list[onnx.NodeProto] = []
     halved: dict[str, str] = {}  # tensors of which there is a copy in fp16
@@ -35,5 +35,5 @@ def in_fp16(model: onnx.ModelProto, names: set[str]) -> onnx.ModelProto:
 
 
 def _cast(node: onnx.NodeProto, given: str, result: str, element: int) -> onnx.NodeProto:
-    """A cast before or after a node, in the same part of the network."""
+    """A cast before or after a node, with a name of the same layer."""
     return onnx.helper.make_node("Cast", [given], [result], name=f"{node.name}/{result}", to=element)

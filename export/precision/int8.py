@@ -1,4 +1,4 @@
-"""Products of features in int8: transformers quantised as they run, convolutions by ranges found beforehand."""
+"""Conversion to int8: MatMuls with dynamic quantisation, convolutions with static quantisation by calibrated ranges."""
 
 import logging
 import math
@@ -13,13 +13,13 @@ from onnxruntime.quantization import QuantType, quantize_dynamic
 from ...runtime.inference.session import open_session, run_session
 from ..graph.subgraph import names_read, replace_nodes
 
-# Fewer products than this for an output are quicker in float32 than to quantise.
+# A convolution with fewer multiplications than this for an output value is faster in float32.
 FEW_TERMS = 64
 LARGEST_BYTE, LARGEST_WEIGHT, LARGEST_BIAS = 255, 127, 1 << 30
-SMALLEST_STEP = 1e-8  # of numbers that are all zero
+MIN_SCALE = 1e-8  # for tensors that are all zero
 # ONNX Runtime convolves two to four times as fast where channels, in and out, are multiples of this.
 LANES = 4
-# Operators that move or repeat the numbers of their first input (all inputs: Concat), and compute nothing.
+# Operators that only move or repeat values, those of their first input (Concat: of all inputs).
 MOVING = ("Concat", "Pad")
 
 Feeds = dict[str, np.ndarray]
@@ -27,14 +27,14 @@ Ranges = dict[str, tuple[float, float]]
 
 
 def in_int8(
-    source: Path, graph: onnx.ModelProto, bearing: Iterable[onnx.NodeProto], examples: Iterable[Feeds]
+    source: Path, graph: onnx.ModelProto, quantizable: Iterable[onnx.NodeProto], examples: Iterable[Feeds]
 ) -> onnx.ModelProto:
-    """The graph in the file `source`, where those of the nodes `bearing` it that have trained weights are in int8.
+    """The graph in the file `source` in int8, as far as nodes are among `quantizable` and have trained weights.
 
-    examples: inputs on which the ranges are found.
+    graph: the same, loaded. examples: inputs on which the ranges of activations are calibrated.
     """
     shapes = {tensor.name: tuple(tensor.dims) for tensor in graph.graph.initializer}
-    weighted = [node for node in bearing if node.input[1] in shapes]
+    weighted = [node for node in quantizable if node.input[1] in shapes]
     convolutions = [
         node for node in weighted if node.op_type == "Conv" and math.prod(shapes[node.input[1]][1:]) >= FEW_TERMS
     ]
@@ -54,11 +54,11 @@ def in_int8(
         )
     finally:
         logging.disable(logging.NOTSET)
-    return _Convolutions(onnx.load(dynamic), {node.name for node in convolutions}, ranges).rounded()
+    return _Convolutions(onnx.load(dynamic), {node.name for node in convolutions}, ranges).converted()
 
 
 def _ranges(source: Path, graph: onnx.ModelProto, tensors: Iterable[str], examples: Iterable[Feeds]) -> Ranges:
-    """The least and the largest number of each of some tensors on the examples; zero is never outside."""
+    """The smallest and the largest value of each tensor on the examples; the range always contains zero."""
     watched = onnx.ModelProto()
     watched.CopyFrom(graph)
     del watched.graph.output[:]
@@ -79,23 +79,23 @@ def _ranges(source: Path, graph: onnx.ModelProto, tensors: Iterable[str], exampl
 
 
 class _Convolutions:
-    """Rounds what convolutions read and yield to int8 and back, which a runtime makes int8 arithmetic of.
+    """Quantises and dequantises inputs and outputs of convolutions (QDQ), which runtimes fuse to int8 convolutions.
 
-    What only convolutions read is rounded before it is put together or its borders are repeated: integers are a
-    quarter of the bytes. (`quantize_static` of ONNX Runtime writes the same but for that, and searches the whole
-    graph at every step, for minutes.)
+    Tensors that only convolutions read are quantised before Concat and Pad: integers are a quarter of the bytes.
+    (`quantize_static` of ONNX Runtime writes the same but for that, and takes minutes, since it searches the whole
+    graph at every step.)
     """
 
     def __init__(self, model: onnx.ModelProto, names: set[str], ranges: Ranges) -> None:
         self.model, self.names, self.ranges = model, names, ranges
         self.weights = {tensor.name: tensor for tensor in model.graph.initializer}
         self.nodes: list[onnx.NodeProto] = []
-        # Tensors rounded to the range of another: as integers, and as the numbers that these stand for.
+        # By tensor and the tensor whose range it is quantised to: the quantised and the dequantised version.
         self.quantized: dict[tuple[str, str], str] = {}
         self.dequantized: dict[tuple[str, str], str] = {}
         self.scales: dict[str, list[str]] = {}
 
-    def rounded(self) -> onnx.ModelProto:
+    def converted(self) -> onnx.ModelProto:
         """The model, with other nodes and weights."""
         moved = self._moved()
         for node in self.model.graph.node:
@@ -109,7 +109,7 @@ class _Convolutions:
         return self.model
 
     def _moved(self) -> dict[str, str]:
-        """What is to be moved as integers, and the tensor that it becomes for convolutions, whose range it shares."""
+        """Outputs of `MOVING` nodes to quantise early, each with the convolution input whose range it has."""
         readers: dict[str, list[onnx.NodeProto]] = {}
         for node in self.model.graph.node:
             for name in names_read(node):
@@ -128,7 +128,7 @@ class _Convolutions:
         return moved
 
     def _move(self, node: onnx.NodeProto, whose: str) -> None:
-        """Have a node move integers."""
+        """Have a Concat or Pad move quantised values."""
         result = node.output[0]
         for index in range(len(node.input) if node.op_type == "Concat" else 1):
             node.input[index] = self._quantized(node.input[index], whose)
@@ -136,7 +136,7 @@ class _Convolutions:
         self.nodes.append(node)
 
     def _convolution(self, node: onnx.NodeProto) -> None:
-        """Round what a convolution reads, its weights, and what it yields."""
+        """Quantise a convolution's input, weights and output."""
         given, result = node.input[0], node.output[0]
         kernel, *bias = (onnx.numpy_helper.to_array(self.weights[name]) for name in node.input[1:])
         outputs, inputs = kernel.shape[:2]
@@ -156,11 +156,11 @@ class _Convolutions:
         self.dequantized[result, result] = self._dequantize(integers, result, result)
 
     def _rounded_weights(self, node: onnx.NodeProto, weights: list[np.ndarray], step: np.float32) -> list[str]:
-        """The kernel and bias of a convolution whose input has this step, rounded."""
+        """Names of the quantised kernel and bias of a convolution; step: the input's scale."""
         kernel, *bias = weights
         channels = kernel.reshape(len(kernel), -1)
-        steps = np.maximum(np.abs(channels).max(axis=1) / LARGEST_WEIGHT, SMALLEST_STEP)
-        for values in bias:  # is in steps of the product
+        steps = np.maximum(np.abs(channels).max(axis=1) / LARGEST_WEIGHT, MIN_SCALE)
+        for values in bias:  # its scale is the product of the kernel's and the input's
             steps = np.maximum(steps, np.abs(values) / (LARGEST_BIAS * step))
         steps = steps.astype(np.float32)
         integers = [np.rint(channels / steps[:, None]).astype(np.int8).reshape(kernel.shape)]
@@ -175,10 +175,10 @@ class _Convolutions:
         return results
 
     def _pad_channels(self, name: str, channels: int, axes: int) -> str:
-        """A tensor whose integers are those of another in its range, and so many channels of zeros."""
+        """The name of a tensor with that many more channels, of zeros, in the same range."""
         wide = f"{name}.wide"
         if (wide, name) not in self.quantized:
-            # Padding the one axis by its number is more than ONNX Runtime's optimiser bears.
+            # ONNX Runtime's optimiser fails on a Pad with axes, so the pads of all axes are given.
             pads = np.zeros((2, axes), np.int64)
             pads[1, 1] = channels
             given = [self._quantized(name, name), self._constant(f"{wide}.pads", pads.ravel()), self._scale(name)[1]]
@@ -192,23 +192,23 @@ class _Convolutions:
         return self._add("Slice", [name, *given], f"{name}.narrow")
 
     def _quantized(self, name: str, whose: str) -> str:
-        """A tensor as integers in the range of another."""
+        """The quantised version of a tensor, in the range of the tensor `whose`."""
         if (name, whose) not in self.quantized:
             self.quantized[name, whose] = self._quantize(name, whose)
         return self.quantized[name, whose]
 
     def _dequantized(self, name: str, whose: str) -> str:
-        """A tensor as the numbers that its integers stand for."""
+        """The dequantised float32 version of a quantised tensor."""
         if (name, whose) not in self.dequantized:
             self.dequantized[name, whose] = self._dequantize(self._quantized(name, whose), whose, f"{name}.rounded")
         return self.dequantized[name, whose]
 
     def _quantize(self, name: str, whose: str) -> str:
-        """A tensor taken to integers in the range of another."""
+        """Add a QuantizeLinear with the range of the tensor `whose`."""
         return self._add("QuantizeLinear", [name, *self._scale(whose)], f"{name}.integers.{whose}")
 
     def _dequantize(self, name: str, whose: str, result: str) -> str:
-        """Integers taken to the numbers that they stand for in a tensor's range."""
+        """Add a DequantizeLinear with the range of the tensor `whose`."""
         return self._add("DequantizeLinear", [name, *self._scale(whose)], result)
 
     def _add(self, operator: str, given: list[str], result: str, **attributes: Any) -> str:
@@ -217,7 +217,7 @@ class _Convolutions:
         return result
 
     def _scale(self, whose: str) -> list[str]:
-        """The step and the zero of the integers that stand for a tensor's range."""
+        """Constants for the scale and the zero point of a tensor's range."""
         if whose not in self.scales:
             step = _step(self.ranges[whose])
             zero = np.uint8(np.clip(np.rint(-self.ranges[whose][0] / step), 0, LARGEST_BYTE))
@@ -231,5 +231,5 @@ class _Convolutions:
 
 
 def _step(bounds: tuple[float, float]) -> np.float32:
-    """The difference between neighbours among the 256 numbers that stand for a range."""
-    return np.float32(max((bounds[1] - bounds[0]) / LARGEST_BYTE, SMALLEST_STEP))
+    """The scale of a range: its width over 255."""
+    return np.float32(max((bounds[1] - bounds[0]) / LARGEST_BYTE, MIN_SCALE))

@@ -1,1 +1,1 @@
-"""Comparison of exported graphs with the network in PyTorch."""
+"""Verification of exported graphs against the network in PyTorch."""

@@ -1,8 +1,8 @@
-"""Cases on which exported graphs are verified: a rendered room and noise, cameras and depth ranges that differ by view.
+"""Verification cases: a synthetic room and noise, with cameras and depth ranges that differ by view.
 
-A graph can be wrong for one kind of input alone: other numbers of views take another branch of `nearest_views`, square
-images hide exchanged axes, equal intrinsics hide a view that uses another's, and the trained depth range hides one
-that was baked in. Noise gives every part work to do; a rendered image has flat areas, edges and consistent geometry.
+A graph can be wrong for some inputs only. Other numbers of views take another branch of `nearest_views`, square images
+hide swapped axes, equal intrinsics hide a view that uses another's, and the trained depth range hides one that was
+traced as a constant. Noise excites every layer; a rendered image has flat areas, edges and consistent geometry.
 """
 
 from collections.abc import Iterator
@@ -17,40 +17,40 @@ from ..example_inputs import example_inputs, room_inputs, with_room
 from ..stages import NamedTensors
 from ..tracing import StaticShape
 
-# Where views are not fixed; more than `ORDERED_VIEWS` of model/common/geometry.py, and more than a view has neighbours.
+# With dynamic views; more than `ORDERED_VIEWS` of model/common/geometry.py, and more than a view has neighbours.
 MAX_CASE_VIEWS = 5
-# By how much the views' focal lengths, principal points and depth ranges differ.
+# Spread over the views of focal lengths, principal points and near ends.
 FOCAL_SPREAD, CENTRE_SPREAD, NEAR_SPREAD = 0.15, 0.04, 0.3
-NEARER = 0.8  # a near end over the trained one
-# Far over near, from the first view to the last: so little that the far end counts in inverse depths.
-LEAST_RANGE, LARGEST_RANGE = 3.0, 6.0
+NEAR_FACTOR = 0.8  # of the trained near end
+# Far over near, from the first view to the last: small, so that the far end matters in inverse depth.
+MIN_RANGE, MAX_RANGE = 3.0, 6.0
 
 
 @dataclass(frozen=True)
 class Case:
-    """What the network computes for some views: its inputs and all that its stages yield, by name."""
+    """Inputs, and what the network computes from them: every tensor between stages and every output, by name."""
 
     name: str
     views: int
     tensors: dict[str, np.ndarray]
 
 
-def verification_cases(network: NamedTensors, description: ModelMetadata, static: StaticShape) -> Iterator[Case]:
-    """Cases of different numbers of views, sizes and contents, as far as views and size are not fixed."""
-    near, far, block = description.near, description.far, description.size_multiple
-    trained = static.size or (description.height, description.width)
+def verification_cases(network: NamedTensors, metadata: ModelMetadata, static: StaticShape) -> Iterator[Case]:
+    """Cases of different numbers of views, sizes and contents, as far as views and size are dynamic."""
+    near, far, block = metadata.near, metadata.far, metadata.size_multiple
+    trained = static.size or (metadata.height, metadata.width)
     across, upright = (static.size or (rows * block, columns * block) for rows, columns in ((6, 8), (8, 6)))
     room = room_inputs(static.views or 2, *trained, near, far)
     yield _case(network, "room", room)
     noise = example_inputs(static.views or MAX_CASE_VIEWS, *across, near, far)
     yield _case(network, "noise", different_cameras(noise))
-    nearer = NEARER * near
-    cameras = different_cameras(example_inputs(static.views or 3, *upright, nearer, far))
-    yield _case(network, "room", with_room(cameras, nearer))
+    case_near = NEAR_FACTOR * near
+    cameras = different_cameras(example_inputs(static.views or 3, *upright, case_near, far))
+    yield _case(network, "room", with_room(cameras, case_near))
 
 
 def different_cameras(inputs: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The same inputs with intrinsics and a depth range of each view's own."""
+    """The same inputs with different intrinsics and depth ranges in each view."""
     views = len(inputs["images"])
     spread = torch.linspace(-1, 1, views)
     intrinsics = inputs["intrinsics"].clone()
@@ -59,7 +59,7 @@ def different_cameras(inputs: dict[str, Tensor]) -> dict[str, Tensor]:
     intrinsics[:, 0, 2] += CENTRE_SPREAD * spread
     intrinsics[:, 1, 2] -= CENTRE_SPREAD * spread
     near = inputs["near"] * (1 + NEAR_SPREAD * torch.linspace(0, 1, views))
-    far = near * torch.linspace(LEAST_RANGE, LARGEST_RANGE, views)
+    far = near * torch.linspace(MIN_RANGE, MAX_RANGE, views)
     return inputs | {"intrinsics": intrinsics, "near": near, "far": far}
 
 

@@ -68,11 +68,11 @@ class Exported:
 
 
 def verify(
-    network: NamedTensors, exported: Exported, description: ModelMetadata, static: StaticShape
+    network: NamedTensors, exported: Exported, metadata: ModelMetadata, static: StaticShape
 ) -> Iterator[TensorError]:
     """Compare the graph of every stage with the network, and what is written for the user end to end."""
-    cases = list(verification_cases(network, description, static))
-    yield from compare(exported, cases, network.family.tolerances[description.precision])
+    cases = list(verification_cases(network, metadata, static))
+    yield from compare(exported, cases, network.family.tolerances[metadata.precision])
 
 
 def compare(exported: Exported, cases: list[Case], tolerance: Tolerance) -> Iterator[TensorError]:

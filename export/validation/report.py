@@ -1,4 +1,4 @@
-"""The verification as tables: one line a stage, or every tensor of every case."""
+"""Tables of the verification: one line a stage, or every tensor of every case."""
 
 import sys
 from collections.abc import Sequence
@@ -12,13 +12,13 @@ from .compare import QUANTILE_NAMES, TensorError
 TITLE = "ONNX Runtime against PyTorch: errors in standard deviations of each channel"
 LEGEND = (
     "median: of the worst channel of the worst view; 99 % and 99.9 %: percentiles of the worst view. "
-    "A stage passes if each is within its bound; shown is the one that comes closest to it."
+    "A stage passes if each is within its bound; the table shows the one closest to its bound."
 )
 SUMMARY_WIDTH, DETAILS_WIDTH = 120, 170  # where it is not a terminal's
 
 
 def print_summary(errors: Sequence[TensorError]) -> None:
-    """Print one line a stage: the tensor and the figure that are closest to their bound, or beyond it."""
+    """Print one line a stage: the tensor and the quantile that are closest to their bound, or furthest beyond it."""
     table = Table(title=TITLE, caption=LEGEND)
     for column in ("stage", "tensors", "worst tensor", "case", "figure"):
         table.add_column(column)
@@ -37,7 +37,7 @@ def print_summary(errors: Sequence[TensorError]) -> None:
 
 
 def print_details(errors: Sequence[TensorError]) -> None:
-    """Print every tensor of every case, with each figure over its bound, and the largest error, which has none."""
+    """Print every tensor of every case, with each quantile and its bound, and the largest error, which has none."""
     table = Table(title=TITLE)
     for column in ("case", "stage", "tensor"):
         table.add_column(column)
