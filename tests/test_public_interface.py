@@ -17,7 +17,7 @@ ROOT = Path(__file__).parent.parent
 NAMES = {
     *("reconstruct", "Reconstruction", "Predictor", "Runner", "Gaussians", "read_splats", "write_splats", "Camera"),
     *("read_cameras", "write_cameras", "estimate_cameras", "rasterize", "render", "evaluate", "bundled_model"),
-    *("InputError", "__version__"),
+    *("InputError", "__version__", "export_checkpoint"),
 }
 
 
@@ -53,6 +53,7 @@ def test_old_names_are_kept_for_a_version():
 SIGNATURES = {
     "reconstruct": ["images", "cameras", "model", "select", "views", "size", "near", "far", "progress"],
     "evaluate": ["images", "cameras", "model"],
+    "export_checkpoint": ["checkpoint", "out", "staged"],
     "estimate_cameras": ["focal"],
     "read_cameras": ["path"],
     "write_cameras": ["path", "cameras"],

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from ..cameras.camera import Camera
 
-# Where else datasets keep photographs, which no command of ours reads there unasked.
+# Another folder where datasets keep images; commands read there only what they are given.
 UNDISTORTED_FROM = "input"
 
 

@@ -1,11 +1,10 @@
 """What a command reads and what it writes, known in one place, so that no file is lost.
 
 An output is refused if it is a file that the same run reads, if it is another output of the run, or if it exists and
-no command of ours wrote it (see `written_files`). The option --overwrite lifts the last of these alone: nothing is
-gained by replacing what is being read.
+no command of ours wrote it (see `output_records`). The option --overwrite lifts the last of these alone.
 
 A command is decorated with `command`; inside, `outputs()` takes its inputs and outputs as soon as they are
-known. Whatever is written through `files.replacing` without having been announced is checked then.
+known. Whatever is written through `atomic_write` without having been announced is checked then.
 """
 
 import functools
@@ -64,7 +63,7 @@ class Outputs:
                     folder.rmdir()
 
     def reads(self, what: str, paths: Iterable[Path]) -> None:
-        """Announce files that the run reads, and what they are, such as "a photograph"; absent ones count, too.
+        """Announce files that the run reads, and what they are, such as "an image"; absent ones count, too.
 
         Raises InputError if one of them is an output.
         """

@@ -14,20 +14,20 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def draw_progress() -> Iterator[None]:
-    """Draw the progress of the work in the block; nothing is drawn where stderr is no terminal."""
+def show_progress() -> Iterator[None]:
+    """Show the progress of the work in the block, where stderr is a terminal."""
     if not sys.stderr.isatty():
         yield
         return
-    drawing = _Drawing()
-    with reporting_to(drawing.update):
+    display = _Display()
+    with reporting_to(display.update):
         try:
             yield
         finally:
-            drawing.stop()
+            display.stop()
 
 
-class _Drawing:
+class _Display:
     """The bars and spinners of the work in progress, by its description."""
 
     def __init__(self) -> None:

@@ -103,16 +103,16 @@ def render(
     _announce(scene, cameras, views, stems, out, kinds)
     gaussians = read_splats(scene)
     views = offset_cameras(views, read_offset(scene))
-    shots = _choose_cameras(gaussians, views, orbit, path, degrees, frames, size)
-    check_image_sizes(shots)
+    trajectory = _choose_cameras(gaussians, views, orbit, path, degrees, frames, size)
+    check_image_sizes(trajectory)
     render_camera = _renderer(gaussians, colour)
     if out.suffix.lower() == VIDEO:
-        written = _save_video(render_camera, shots, out, fps, kinds)
+        written = _save_video(render_camera, trajectory, out, fps, kinds)
     else:
-        written = _save_images(render_camera, shots, stems, kinds)
+        written = _save_images(render_camera, trajectory, stems, kinds)
     for file in written if len(written) <= MOST_LISTED else [f"{len(written)} files in {out}"]:
         say(f"wrote {file}")
-    images = "1 image" if len(shots) == 1 else f"{len(shots)} images"
+    images = "1 image" if len(trajectory) == 1 else f"{len(trajectory)} images"
     say(f"{len(gaussians):,} Gaussians rendered in {images}; open {out} in any {_viewer(out)}")
 
 
@@ -199,29 +199,33 @@ def _choose_cameras(
 
 
 def _renderer(gaussians: Gaussians, background: tuple[float, float, float]) -> Callable[[Camera], Rendering]:
-    def render_camera(shot: Camera) -> Rendering:
-        return render_view(gaussians, shot.extrinsics, shot.K, shot.width, shot.height, background)
+    def render_camera(camera: Camera) -> Rendering:
+        return render_view(gaussians, camera.extrinsics, camera.K, camera.width, camera.height, background)
 
     return render_camera
 
 
 def _save_video(
-    render_camera: Callable[[Camera], Rendering], shots: Sequence[Camera], out: Path, fps: float, kinds: Sequence[str]
+    render_camera: Callable[[Camera], Rendering],
+    trajectory: Sequence[Camera],
+    out: Path,
+    fps: float,
+    kinds: Sequence[str],
 ) -> list[Path]:
     """A video of each kind; the paths written."""
-    width, height = shots[0].width, shots[0].height
-    for shot in shots:
-        if (shot.width, shot.height) != (width, height):
+    width, height = trajectory[0].width, trajectory[0].height
+    for camera in trajectory:
+        if (camera.width, camera.height) != (width, height):
             raise InputError(
-                f"--out {out}: {shot.name} has {shot.width}x{shot.height} pixels, {shots[0].name} {width}x{height}, "
-                "and a video has one size; add --size"
+                f"--out {out}: {camera.name} has {camera.width}x{camera.height} pixels, {trajectory[0].name} "
+                f"{width}x{height}, and a video has one size; add --size"
             )
     limits: tuple[float, float] | None = None  # the first frame's, so that colours mean the same in all
     with ExitStack() as stack:
         videos = {kind: _video_path(out, kind) for kind in kinds}
         add = {kind: stack.enter_context(open_video(video, width, height, fps)) for kind, video in videos.items()}
-        for shot in progress(shots, "rendering"):
-            rendering = render_camera(shot)
+        for camera in progress(trajectory, "rendering"):
+            rendering = render_camera(camera)
             limits = limits or inverse_depth_range(_depth(rendering))
             for kind in kinds:
                 add[kind](_image(rendering, kind, limits))
@@ -229,12 +233,15 @@ def _save_video(
 
 
 def _save_images(
-    render_camera: Callable[[Camera], Rendering], shots: Sequence[Camera], stems: Sequence[Path], kinds: Sequence[str]
+    render_camera: Callable[[Camera], Rendering],
+    trajectory: Sequence[Camera],
+    stems: Sequence[Path],
+    kinds: Sequence[str],
 ) -> list[Path]:
     """An image of each kind for each camera, and metric depth; the paths written."""
     written = []
-    for shot, stem in progress(list(zip(shots, stems, strict=True)), "rendering"):
-        rendering = render_camera(shot)
+    for camera, stem in progress(list(zip(trajectory, stems, strict=True)), "rendering"):
+        rendering = render_camera(camera)
         for kind in kinds:
             target = _image_path(stem, kind)
             save_png(target, _image(rendering, kind))

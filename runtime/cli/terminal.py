@@ -25,7 +25,7 @@ from ..errors import (
     printable,
     report_error,
 )
-from .progress_bar import draw_progress
+from .progress_bar import show_progress
 
 STDERR = 2
 SYSTEM_REMEDY = "give files and a standard output that can be read and written, on disks with room"
@@ -45,7 +45,7 @@ def run(command: "Callable[..., Any] | typer.Typer") -> None:
         _own_streams(),
         _without_warnings(),
         _without_native_messages(),
-        draw_progress(),
+        show_progress(),
     ):
         status = _status(as_application(command))
     if received and status == SIGNALLED + signal.SIGINT:  # typer takes each for Ctrl-C

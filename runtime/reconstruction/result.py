@@ -122,7 +122,8 @@ class Reconstruction:
 
     def save_report(self, path: Path | str, summary: dict[str, Any] | None = None) -> None:
         """Write one .html with views, renders, depth, consistency and `summary` (`self.summary()` if not given)."""
-        write_report(Path(path), self.depth, self.prediction.need_gaussians(), self.views, summary or self.summary())
+        summary = summary or self.summary([Path(path)])
+        write_report(Path(path), self.depth, self.prediction.need_gaussians(), self.views, summary)
 
     def summary(self, files: Sequence[Path] = (), seconds: dict[str, float] | None = None) -> dict[str, Any]:
         """What was done, as JSON can hold it. files: those written. seconds: instead of `timings`."""

@@ -36,11 +36,11 @@ def test_depth_ranges_go_along(folder):
     assert json.loads(Path("cameras.json").read_text())["cameras"][1]["depth_range"] == [1.5, 15.0]
 
 
-def test_pictures_give_the_size(folder, capsys):
+def test_images_give_the_size(folder, capsys):
     cameras = known(["100", "200"])
     Path("trajectory.txt").write_text(as_re10k(cameras))
     assert run_command(main, "convert", "trajectory.txt", "cameras.json") == 2
-    assert "give the pictures with --images" in capsys.readouterr().err and not Path("cameras.json").exists()
+    assert "give the images with --images" in capsys.readouterr().err and not Path("cameras.json").exists()
     save_images(folder / "frames", ["100.png"])
     assert run_command(main, "convert", "trajectory.txt", "cameras.json", "--images", "frames") == 0
     assert_same(read_cameras(Path("cameras.json")), cameras)

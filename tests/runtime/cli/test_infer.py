@@ -3,6 +3,7 @@
 import json
 import shlex
 import shutil
+import sys
 from pathlib import Path
 
 import cv2
@@ -91,8 +92,8 @@ def test_commands_to_copy_work_in_folders_with_spaces(workplace, capsys):
     cameras = ["--cameras", "my cameras", "--camera-format", "transforms"]
     assert view == ["idesplat", "view", "my scene.ply", *cameras, "--images", "my photographs"]
     assert render == ["idesplat", "render", "my scene.ply", *cameras, "--out", "DIR"]
-    assert run_command(render_main, *render[1:]) == 0
-    assert run_command(view_main, *view[1:], "--html", "page.html") == 0
+    assert run_command(render_main, *render[2:]) == 0
+    assert run_command(view_main, *view[2:], "--html", "page.html") == 0
 
 
 def test_what_is_not_used_is_said(workplace, capsys, monkeypatch):
@@ -102,6 +103,7 @@ def test_what_is_not_used_is_said(workplace, capsys, monkeypatch):
     assert "of each image is used" not in printed.out  # nearly all is
     assert printed.err == ""  # where that is no terminal
     monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     assert run_command(main, *USUAL, "--size", "128x64", "--select", "0,1") == 0
     # of 128 x 96 pixels, at a trained size of 96 x 64
     printed = capsys.readouterr()
@@ -220,6 +222,26 @@ def test_cameras_of_another_format_give_the_same(workplace):
     close = np.abs(read_ply(Path("scene.ply")).means - expected.means).max(axis=1) < 1e-3
     assert close.mean() > 0.99
     assert run_command(main, *given, "--cameras", "trajectory.txt", "--camera-format", "llff") == 2
+
+
+def test_a_folder_alone_is_enough(workplace, capsys):
+    """Cameras beside the images, and the splats named after the folder."""
+    assert run_command(main, ".", "--model", "model.onnx") == 0
+    printed = capsys.readouterr().out
+    out = Path(f"{workplace.name}.ply")
+    assert len(read_splats(out)) == 2 * 64 * 96
+    assert "cameras found beside the photographs: ." in printed and f"wrote {out}" in printed
+    assert run_command(main, "images", "--model", "model.onnx", "-q") == 0
+    (line,) = capsys.readouterr().out.splitlines()  # no notes
+    assert line.startswith("wrote images.ply")
+    assert Path("images.ply").read_bytes() == out.read_bytes()
+
+
+def test_neither_images_nor_a_name_to_write(workplace, capsys):
+    assert run_command(main) == 2
+    assert "PHOTOS: none given" in capsys.readouterr().err
+    assert run_command(main, "--cameras", "transforms.json") == 2
+    assert "--out: expected the file to write" in capsys.readouterr().err
 
 
 def test_photographs_alone(workplace, tmp_path_factory, capsys):

@@ -145,7 +145,7 @@ def test_pictures_never_overwrite_each_other(
         ("none.ply", "cameras.json", "0,0,0", "none.ply: No such file"),
         ("cameras.json", "cameras.json", "0,0,0", "cameras.json: expected a splat file"),
         ("scene.ply", "none.json", "0,0,0", "none.json"),
-        ("scene.ply", "scene.ply", "0,0,0", "scene.ply: is none of the camera files"),
+        ("scene.ply", "scene.ply", "0,0,0", "scene.ply: holds no cameras of a known format"),
         ("scene.ply", "cameras.json", "0,255,0", "--background 0,255,0: expected red, green and blue from 0 to 1"),
         ("scene.ply", "cameras.json", "0,nan,0", "--background 0,nan,0"),
         ("scene.ply", "cameras.json", "1,1", "--background 1,1"),

@@ -4,7 +4,7 @@ import io
 import sys
 
 import pytest
-from idesplat.runtime.cli.progress_bar import draw_progress
+from idesplat.runtime.cli.progress_bar import show_progress
 from idesplat.runtime.system.progress import Progress, progress, reporting_to, working
 
 
@@ -37,11 +37,11 @@ class Terminal(io.StringIO):
 
 
 @pytest.mark.parametrize("is_terminal", [True, False])
-def test_commands_draw_progress_on_terminals_only(monkeypatch: pytest.MonkeyPatch, is_terminal: bool) -> None:
+def test_commands_show_progress_on_terminals_only(monkeypatch: pytest.MonkeyPatch, is_terminal: bool) -> None:
     monkeypatch.setenv("TERM", "xterm")
     stream = Terminal() if is_terminal else io.StringIO()
     monkeypatch.setattr(sys, "stderr", stream)
-    with draw_progress():
+    with show_progress():
         with working("loading [it]"):
             pass
         list(progress("ab", "reading"))
