@@ -111,11 +111,13 @@ def train(
     from .perceptual import check_lpips
     from .trainer import train as train_network
 
-    if perceptual is PerceptualKind.LPIPS and settings.renders:
-        try:
-            check_lpips()
-        except InputError as missing:
-            warn(f"warning: {missing}")
+    def warn_without_lpips() -> None:
+        if perceptual is PerceptualKind.LPIPS and settings.renders:
+            try:
+                check_lpips()
+            except InputError as missing:
+                warn(f"warning: {missing}")
+
     with _progress_bar(steps) as on_step:
         train_network(
             settings,
@@ -126,6 +128,7 @@ def train(
             threads=threads,
             save_every=save_every * SECONDS_PER_MINUTE,
             validate_every=validate_every,
+            on_start=warn_without_lpips,
             on_step=on_step,
         )
     say(

@@ -59,13 +59,15 @@ def train(
     threads: int = 1,
     save_every: float = 180.0,
     validate_every: int = 200,
+    on_start: Callable[[], None] | None = None,
     on_step: OnStep | None = None,
 ) -> None:
     """Train a network in the folder `out`, or resume the run whose checkpoint is there.
 
     config: the network's, if not that of the preset. features: folder of cached features, by default one inside `out`.
     processes: data-parallel processes, at most the batch size. threads: PyTorch's, in each process.
-    save_every: seconds between checkpoints. validate_every: steps between validations. on_step: called after each step.
+    save_every: seconds between checkpoints. validate_every: steps between validations. on_start: called once weights
+    and data are loaded. on_step: called after each step. LPIPS is left out where it is not installed.
 
     Raises InputError for settings that contradict each other, for a checkpoint of another run, and for unusable data.
     """
@@ -73,6 +75,8 @@ def train(
     if processes > settings.batch:
         raise InputError(f"--processes {processes}: more than the {settings.batch} scenes of a step; raise --batch")
     trainer = Trainer(out, settings, config, features, ProcessGroup(0, processes), threads)
+    if on_start is not None:
+        on_start()
     with spawn_workers(processes, _work, out, settings, config, features, threads, validate_every):
         trainer.fit(save_every, validate_every, on_step)
 

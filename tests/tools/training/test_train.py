@@ -393,8 +393,8 @@ def test_validation_renders_held_out_images(scene: Path, tmp_path: Path, monkeyp
             used[now].update(path.name for path, _ in pairs)
         return build_view_batch(pairs, *rest)
 
-    monkeypatch.setattr(captures, "take", noted)
-    monkeypatch.setattr(captures, "prepare", noted_all)
+    monkeypatch.setattr(captures, "load_view", noted)
+    monkeypatch.setattr(captures, "build_view_batch", noted_all)
     settings = replace(SETTINGS, objective="photometric", data=[str(scene)])
     run = Trainer(tmp_path, settings, SMALL)
     for seed in range(40):
