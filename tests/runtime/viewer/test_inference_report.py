@@ -1,4 +1,4 @@
-"""The page that idesplat-infer --report writes: what it says, and that a browser shows it whatever files are called."""
+"""The report of idesplat infer --report: its content, and that a browser shows it whatever files are called."""
 
 import html
 import json
@@ -21,7 +21,7 @@ SIDE = 64
 
 @pytest.fixture(scope="module")
 def written(scene, exported, tmp_path_factory) -> Path:
-    """A folder with report.html and summary.json, from photographs with names that a page must not believe."""
+    """A folder with report.html and summary.json, from images whose names hold markup."""
     folder = tmp_path_factory.mktemp("report")
     (folder / "images").mkdir()
     cameras = json.loads((scene / "transforms.json").read_text())
@@ -49,18 +49,18 @@ def test_shows_every_view_and_runs_nothing(browser, written):
     titles = page.eval_on_selector_all("h3", "found => found.map(title => title.textContent)")
     title = page.title()
     context.close()
-    assert widths == [96] * 3 * 4  # photograph, drawn, depth, confidence
+    assert widths == [96] * 3 * 4  # image, rendered, depth, consistency
     assert titles == [f"{index}{TRAP}.png" for index in range(3)]
     assert title == f"idesplat: {TRAP}.ply"
     assert complaints == []
     assert [url for url in requests if not url.startswith(("file:", "data:"))] == []
 
 
-def test_says_what_the_summary_says(written):
+def test_shows_the_values_of_the_summary(written):
     page = html.unescape((written / "report.html").read_text())
     summary = json.loads((written / "summary.json").read_text())
     assert str(written / "report.html") in summary["files"]
-    assert "3 photographs became 18,432 Gaussians" in page
+    assert "3 images became 18,432 Gaussians" in page
     for name in ("load", "model", "total"):
         assert f"<th>{name}</th><td>{summary['seconds'][name]:.2f}</td>" in page
     for words in (f"{summary['near']:.6g}", summary["near_far_from"], "idesplat-small", *summary["notes"]):
@@ -68,7 +68,7 @@ def test_says_what_the_summary_says(written):
 
 
 def flat_scene(colour: float) -> tuple[np.ndarray, Gaussians, ViewBatch]:
-    """Two cameras before a grey wall, and splats that show it in this brightness."""
+    """Two cameras in front of a grey wall, and splats of it with this brightness."""
     extrinsics = np.stack([np.eye(4), np.eye(4)])
     extrinsics[1, 0, 3] = 0.1
     intrinsics = np.tile(np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]], np.float32), (2, 1, 1))
@@ -77,12 +77,12 @@ def flat_scene(colour: float) -> tuple[np.ndarray, Gaussians, ViewBatch]:
     means = points_from_depth(depth, images, extrinsics, intrinsics).positions
     count = len(means)
     scales, quats = np.full((count, 3), 0.05), np.tile([1.0, 0, 0, 0], (count, 1))
-    wide = means * [3, 3, 1]  # beyond the edges of both pictures
+    wide = means * [3, 3, 1]  # beyond the edges of both images
     gaussians = with_colours(wide, scales * 3, quats, np.ones(count), np.full((count, 3), colour))
     return depth, gaussians, ViewBatch(["a", "b"], images, extrinsics, intrinsics, [])
 
 
-def test_psnr_and_confidence_of_what_is_known(tmp_path):
+def test_psnr_and_consistency_of_a_known_scene(tmp_path):
     depth, gaussians, views = flat_scene(0.6)
     depth[1, :, : SIDE // 2] = 4.0  # where it sees through what the first view sees
     write_report(tmp_path / "r.html", depth, gaussians, views, {"seconds": {}, "notes": [], "files": ["s.ply"]})
@@ -90,6 +90,6 @@ def test_psnr_and_confidence_of_what_is_known(tmp_path):
     found = [float(value) for value in re.findall(r"<figcaption>[^<]*PSNR ([\d.]+) dB", page)]
     assert found == pytest.approx([-20 * np.log10((153 - 128) / 255)] * 2, abs=0.05)
     assert "depth 2 to 4" in page
-    confirmed = [int(value) for value in re.findall(r"<figcaption>confidence, mean (\d+) %", page)]
+    confirmed = [int(value) for value in re.findall(r"<figcaption>consistency, mean (\d+) %", page)]
     # a point at depth 2 moves by 0.05 of the width: 45 % of the first view falls on the half that sees through it
     assert confirmed[0] == pytest.approx(55, abs=3)
