@@ -1,4 +1,4 @@
-"""The model that is carried along, so that photographs become splats with nothing downloaded (see MODEL_CARD.md)."""
+"""The bundled model, with which images become splats without a download (see MODEL_CARD.md)."""
 
 import hashlib
 from pathlib import Path
@@ -7,12 +7,12 @@ from ..errors import InputError
 
 NAME = "idesplat-tiny.onnx"
 FOLDER = Path(__file__).with_name("bundled")
-# Beside the model, as `sha256sum` writes it and `sha256sum --check` reads it.
+# The file beside the model, in the format of `sha256sum`.
 CHECKSUM_SUFFIX = ".sha256"
 
 
 def bundled_model() -> Path:
-    """The carried model's path; raises InputError if the file is not the one that was carried."""
+    """Path of the bundled model; raises InputError if the file is missing or its SHA-256 is not the expected one."""
     path = FOLDER / NAME
     remedy = "install idesplat again, or give --model"
     try:
@@ -20,7 +20,7 @@ def bundled_model() -> Path:
         with path.open("rb") as file:
             found = hashlib.file_digest(file, "sha256").hexdigest()
     except (OSError, IndexError) as error:
-        raise InputError(f"{path}: the carried model cannot be read ({error}); {remedy}") from None
+        raise InputError(f"{path}: the bundled model cannot be read ({error}); {remedy}") from None
     if found != expected:
-        raise InputError(f"{path}: the carried model is damaged (SHA-256 {found[:8]}, not {expected[:8]}); {remedy}")
+        raise InputError(f"{path}: the bundled model is damaged (SHA-256 {found[:8]}, not {expected[:8]}); {remedy}")
     return path

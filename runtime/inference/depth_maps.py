@@ -1,17 +1,17 @@
-"""Depth maps as files that lead back to points: beside the depth, everything that it takes to do so.
+"""Depth maps as files, with the cameras that are needed to unproject them.
 
-For each view a .png to look at, and a .npz with
+For each view a .png with colours, and a .npz with
 
     depth       z-depth in world units, float32 [height, width]
     K           pixels of the depth map, pixel centres at .5, no distortion, float64 [3, 3]
     extrinsics  camera-to-world, OpenCV axes (x right, y down, z forward), float64 [4, 4]
-    near, far   between which the depth was looked for, world units
-    image       the name of the photograph
-    image_size  width and height of the photograph, pixels
-    crop        from pixels (x, y, 1) of the undistorted photograph to those of the depth map, float64 [3, 3]
+    near, far   bounds of the depth hypotheses, world units
+    image       the name of the image file
+    image_size  width and height of the image, pixels
+    crop        from pixels (x, y, 1) of the undistorted image to those of the depth map, float64 [3, 3]
     offset      what was subtracted from the user's world coordinates (--offset), float64 [3]
 
-so that the pixel in column x and row y lies at `extrinsics[:3, :3] @ (depth[y, x] * inv(K) @ (x + .5, y + .5, 1)) +
+The pixel in column x and row y lies at `extrinsics[:3, :3] @ (depth[y, x] * inv(K) @ (x + .5, y + .5, 1)) +
 extrinsics[:3, 3]`.
 """
 
@@ -35,7 +35,7 @@ def depth_map_files(folder: Path, stems: Sequence[str]) -> list[Path]:
 
 
 def write_depth_maps(folder: Path, stems: Sequence[str], prediction: Prediction, views: ViewBatch) -> list[Path]:
-    """Write a picture and an archive of each view's depth into an existing folder; the paths written.
+    """Write a PNG and an archive of each view's depth into an existing folder; returns the paths written.
 
     stems: the files' names without suffix, all different, [views]. views: what was predicted from.
     Raises InputError if a file cannot be written.
@@ -43,8 +43,8 @@ def write_depth_maps(folder: Path, stems: Sequence[str], prediction: Prediction,
     written = []
     parts = zip(stems, prediction.depth, prediction.cameras, views.cameras, strict=True)
     for stem, depth, camera, original in parts:
-        picture, archive = depth_map_files(folder, [stem])
-        save_depth_png(picture, depth)
+        png, archive = depth_map_files(folder, [stem])
+        save_depth_png(png, depth)
         near, far = camera.depth_range or (np.nan, np.nan)
         with atomic_write(archive) as temporary:
             np.savez_compressed(
@@ -59,5 +59,5 @@ def write_depth_maps(folder: Path, stems: Sequence[str], prediction: Prediction,
                 crop=cover_crop(original.width, original.height, camera.width, camera.height).matrix,
                 offset=views.offset,
             )
-        written += [picture, archive]
+        written += [png, archive]
     return written

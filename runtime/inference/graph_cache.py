@@ -1,8 +1,8 @@
-"""Graphs as ONNX Runtime has optimised them, kept from one run and process to the next.
+"""A cache of the graphs that ONNX Runtime has optimised, shared by processes.
 
-Optimising a graph of thousands of nodes takes several times longer than loading what comes of it. What comes of it
-depends on the processor, so an entry's name says for what it was made, and proves its content: a file that is damaged,
-renamed or made elsewhere is never used. The cache lies in the user's cache folder and may be deleted at any time.
+Optimising a graph of thousands of nodes takes several times longer than loading the result. The result depends on the
+CPU, so an entry's name contains a hash of what it was made for and one of its content: a file that is damaged, renamed
+or made on another machine is not used. The cache is in the user's cache folder and may be deleted at any time.
 """
 
 import hashlib
@@ -24,26 +24,26 @@ from ..system.files import open_regular, remove_abandoned_folders, scratch_folde
 LAYOUT = 1
 SUFFIX = ".onnx"
 KEY_LENGTH = 32  # hexadecimal digits
-# A larger model runs for so long that a second or two of optimising it do not matter, and would crowd out the others.
-LARGEST_MODEL = 256 << 20  # bytes
-LARGEST_CACHE = 1 << 30  # bytes; what was not used for longest goes first
-# How a tensor in ONNX's format says that its values are in another file: the key "location" of a property.
+# Larger models run so long that a second or two of optimisation do not matter, and would displace others.
+MAX_MODEL_BYTES = 256 << 20
+MAX_CACHE_BYTES = 1 << 30  # the least recently used entries are removed first
+# In a TensorProto whose values are in another file: the key "location" of its external_data.
 EXTERNAL = b"\n\x08location"
-# In Linux's /proc/cpuinfo: names and instruction sets, on x86 and on ARM.
-PROCESSOR_FIELDS = ("model name", "flags", "CPU part", "Features")
+# Lines of Linux's /proc/cpuinfo with names and instruction sets, on x86 and ARM.
+CPU_FIELDS = ("model name", "flags", "CPU part", "Features")
 
 Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
 class CacheEntry:
-    """Where one model's optimised graph is kept, for this processor and this ONNX Runtime."""
+    """The cache entry of one model on this CPU with this version of ONNX Runtime."""
 
     folder: Path
     key: str
 
     def get(self) -> Path | None:
-        """The optimised graph, if it is there and intact; what is there and is not, is removed."""
+        """Path of the optimised graph, None if there is none; a damaged one is removed."""
         for path in self.folder.glob(f"{self.key}.*{SUFFIX}"):
             with suppress(OSError):
                 if _is_regular(path) and path.name == self._name(path):
@@ -53,9 +53,9 @@ class CacheEntry:
         return None
 
     def put(self, make: Callable[[Path], Result]) -> Result:
-        """Have `make` write the optimised graph to a path, keep it whole or not at all, and return what `make` does.
+        """Call `make` with a path to write the optimised graph to, store it atomically, and return what `make` returns.
 
-        Raises OSError where the folder cannot be written, and what `make` raises.
+        Raises OSError if the folder cannot be written, and whatever `make` raises.
         """
         with scratch_folder(self.folder) as scratch:
             temporary = scratch / f"graph{SUFFIX}"
@@ -65,12 +65,12 @@ class CacheEntry:
         return result
 
     def evict(self, path: Path) -> None:
-        """Remove an entry that is intact and of no use."""
+        """Remove a graph that ONNX Runtime cannot use."""
         with suppress(OSError):
             path.unlink()
 
     def _name(self, path: Path) -> str:
-        """The name that an entry with the content of `path` has here and nowhere else."""
+        """The file name of an entry with the content of `path`: the key and a hash of key and content."""
         digest = hashlib.sha256(self.key.encode())
         with open_regular(path) as file:
             digest.update(file.read())
@@ -78,9 +78,9 @@ class CacheEntry:
 
 
 def cache_entry(model: Path) -> CacheEntry | None:
-    """Where the optimised graph of a model file belongs; None where it is not to be, or cannot be, kept."""
+    """The cache entry of a model file; None for a model that is not cached, or without a usable cache folder."""
     try:
-        if not _is_regular(model) or model.stat().st_size > LARGEST_MODEL:
+        if not _is_regular(model) or model.stat().st_size > MAX_MODEL_BYTES:
             return None
         content = model.read_bytes()
         if EXTERNAL in content:  # those files' content would have to be part of the key
@@ -90,38 +90,38 @@ def cache_entry(model: Path) -> CacheEntry | None:
         remove_abandoned_folders(folder)
     except (OSError, RuntimeError):  # RuntimeError: there is no home folder
         return None
-    made_for = [LAYOUT, onnxruntime.__version__, onnxruntime.get_build_info(), _processor()]
+    made_for = [LAYOUT, onnxruntime.__version__, onnxruntime.get_build_info(), _cpu()]
     digest = hashlib.sha256(json.dumps(made_for).encode())
     digest.update(content)
     return CacheEntry(folder, digest.hexdigest()[:KEY_LENGTH])
 
 
 def _is_regular(path: Path) -> bool:
-    """Whether it can be read to its end: a named pipe cannot."""
+    """Whether it is a regular file, not a named pipe or device."""
     return stat.S_ISREG(path.stat().st_mode)
 
 
-def _processor() -> str:
-    """What tells processors apart: where the system does not say it in full, this machine's name as well."""
+def _cpu() -> str:
+    """A description of the CPU's type; without /proc/cpuinfo it includes the machine's name."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
         return " ".join(platform.uname())
-    return "\n".join(sorted({line for line in lines if line.startswith(PROCESSOR_FIELDS)}))
+    return "\n".join(sorted({line for line in lines if line.startswith(CPU_FIELDS)}))
 
 
 def _touch(path: Path) -> None:
-    """Note that a file was used just now, where its folder can be written."""
+    """Set a file's time to now, if its folder can be written."""
     with suppress(OSError):
         os.utime(path)
 
 
 def _shrink(folder: Path, newest: Path) -> None:
-    """Remove what was not used for longest until the cache has room again, but never the newest."""
-    with suppress(OSError):  # another process may be at it, too
+    """Remove the least recently used entries until the cache fits its limit, but never the newest."""
+    with suppress(OSError):  # another process may do the same
         entries = sorted((path.stat().st_mtime, path.stat().st_size, path) for path in folder.glob(f"*{SUFFIX}"))
         size = sum(entry[1] for entry in entries)
         for _, bytes_, path in entries:
-            if size > LARGEST_CACHE and path != newest:
+            if size > MAX_CACHE_BYTES and path != newest:
                 path.unlink()
                 size -= bytes_

@@ -1,4 +1,4 @@
-"""Whether a graph is what its metadata and manifest say: before it runs by its signature, afterwards by its results."""
+"""Checks of a graph against its metadata and manifest: of its signature before it runs, of its results afterwards."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,7 +14,7 @@ FLOAT = "tensor(float)"
 
 
 class Value(Protocol):
-    """An input or output as ONNX Runtime describes it; names and None stand for dimensions that are open."""
+    """An input or output as ONNX Runtime describes it; strings and None are dynamic dimensions."""
 
     name: str
     type: str
@@ -22,17 +22,17 @@ class Value(Protocol):
 
 
 class Graph(Protocol):
-    """The part of an ONNX Runtime session that is looked at."""
+    """The part of an ONNX Runtime session that is checked."""
 
     def get_inputs(self) -> Sequence[Value]:
-        """What it reads."""
+        """The inputs."""
 
     def get_outputs(self) -> Sequence[Value]:
-        """What it yields."""
+        """The outputs."""
 
 
 def check_fused(path: Path, graph: Graph, own: ModelMetadata) -> None:
-    """Raise InputError unless the one graph takes the network's inputs and yields what the description promises."""
+    """Raise InputError unless the single graph has the network's inputs and the outputs that the metadata states."""
     inputs, outputs = ({value.name: value for value in part} for part in (graph.get_inputs(), graph.get_outputs()))
     unknown = [name for name in inputs if name not in INPUTS]
     if unknown:
@@ -46,9 +46,9 @@ def check_fused(path: Path, graph: Graph, own: ModelMetadata) -> None:
 def check_stage(
     path: Path, graph: Graph, reads: Sequence[str], yields: Sequence[str], own: ModelMetadata, known: dict[str, str]
 ) -> None:
-    """Raise InputError unless a staged folder's graph reads and yields what the manifest says.
+    """Raise InputError unless a stage's graph has the inputs and outputs of the manifest.
 
-    known: the types of all that earlier stages yield, by name; those of this stage are added.
+    known: the types of the outputs of earlier stages, by name; those of this stage are added.
     """
     inputs, outputs = ({value.name: value for value in part} for part in (graph.get_inputs(), graph.get_outputs()))
     for found, expected, does in ((inputs, reads, "reads"), (outputs, yields, "yields")):
@@ -63,7 +63,7 @@ def check_stage(
 
 
 def check_results(values: Mapping[str, object], views: int, height: int, width: int, own: ModelMetadata) -> None:
-    """Raise InputError unless the results have the shapes and ranges that `Prediction` promises."""
+    """Raise InputError unless the results have the shapes and ranges that `Prediction` documents."""
     count, coefficients = views * height * width, (own.sh_degree + 1) ** 2
     shapes: dict[str, tuple[int, ...]] = {
         "depth": (views, height, width),
@@ -83,13 +83,13 @@ def check_results(values: Mapping[str, object], views: int, height: int, width: 
             share = 100 * (1 - finite.mean())
             raise InputError(
                 f"the graph yields NaN or infinity in {share:.3g} % of {name}: its weights are damaged, or its "
-                f"precision ({shown(own.precision)}) does not hold its numbers; export it again, in float32"
+                f"precision ({shown(own.precision)}) is too low for it; export it again in float32"
             )
     _check_signs(values, own)
 
 
 def _check_signs(values: Mapping[str, object], own: ModelMetadata) -> None:
-    """Depth is positive, and so are scales; opacities are shares."""
+    """Raise InputError unless depth is positive, scales at least 0 and opacities within 0 and 1."""
     ranges = {"depth": (np.nextafter(np.float32(0), 1), np.inf), "scales": (0, np.inf), "opacities": (0, 1)}
     for name, (low, high) in ranges.items():
         value = values[name] if name in promised(own) else None
@@ -101,7 +101,7 @@ def _check_signs(values: Mapping[str, object], own: ModelMetadata) -> None:
 
 
 def _check_values(path: Path, inputs: Mapping[str, Value], outputs: Mapping[str, Value], own: ModelMetadata) -> None:
-    """Types and shapes of the network's own inputs and outputs; those between stages may be of any kind."""
+    """Check types and shapes of the network's inputs and outputs; tensors between stages may have any."""
     views = own.fixed_views or None
     height, width = (own.height, own.width) if own.fixed_size else (None, None)
     count = views * height * width if views and height and width else None
@@ -127,11 +127,11 @@ def _check_values(path: Path, inputs: Mapping[str, Value], outputs: Mapping[str,
 
 
 def _fits(found: Sequence[int | str | None], expected: Sequence[int | None], exactly: bool) -> bool:
-    """Whether a declared shape allows what is expected.
+    """Whether a declared shape agrees with the expected one.
 
-    exactly: a dimension that is open must be so in the graph, too; of results, the optimiser may find out more.
+    exactly: dynamic dimensions must be dynamic in the graph, too; for outputs, the optimiser may infer their size.
     """
-    if not found and not exactly:  # ONNX Runtime's word for a shape that is not known
+    if not found and not exactly:  # ONNX Runtime's shape of an output of unknown rank
         return True
     sizes = [size if isinstance(size, int) else None for size in found]
     if exactly:

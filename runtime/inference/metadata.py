@@ -1,4 +1,4 @@
-"""What an exported model says of itself: metadata inside every `.onnx`, and the manifest of a staged folder."""
+"""Metadata of exported models: a property in every `.onnx`, and the manifest of a staged folder."""
 
 import json
 from collections.abc import Sequence
@@ -9,17 +9,17 @@ from ..errors import InputError
 from ..system.files import read_bytes
 from .metadata_fields import Check, checked_fields, distance, flag, names, pair, parse_object, shown, string, whole
 
-# The metadata property that holds the description as JSON, and the only version of its layout so far.
+# The metadata property that holds `ModelMetadata` as JSON, and the only version of its layout so far.
 METADATA_KEY = "idesplat"
 LAYOUT = 1
 MANIFEST_NAME = "manifest.json"
 MANIFEST_FORMAT = "idesplat-staged"
-# Far beyond every network that there is: more would only take time and memory.
-MOST_STAGES = 32
-MOST_BYTES = 1 << 20  # of metadata and manifests
-LARGEST_SIDE = 1 << 16  # pixels
-MOST_VIEWS = 1 << 12
-HIGHEST_SH_DEGREE = 3  # that `Gaussians` and the splat files know
+# Limits far beyond every existing network.
+MAX_STAGES = 32
+MAX_BYTES = 1 << 20  # of metadata and manifests
+MAX_SIDE = 1 << 16  # pixels
+MAX_VIEWS = 1 << 12
+MAX_SH_DEGREE = 3
 INPUTS = ("images", "extrinsics", "intrinsics", "near", "far")
 OUTPUTS = ("depth", "means", "scales", "quats", "opacities", "sh")
 CONVENTIONS = (
@@ -30,7 +30,7 @@ CONVENTIONS = (
 
 @dataclass(frozen=True)
 class ModelMetadata:
-    """How a model is to be fed and what it yields."""
+    """The inputs that a model expects, what it was trained on, and what it predicts."""
 
     preset: str
     # Trained image size; other sizes must be multiples of `size_multiple`, unless `fixed_size` is true.
@@ -38,12 +38,12 @@ class ModelMetadata:
     width: int
     size_multiple: int
     fixed_size: bool
-    # Zero means any number from two.
+    # 0 for any number of views from two.
     fixed_views: int
     # The range of depth it was trained with, in scene units.
     near: float
     far: float
-    # The fewest and the most views it was trained with, and the shortest and longest side of its images.
+    # The least and the greatest number of views in training, and the shortest and longest side of its images.
     trained_views: list[int]
     trained_sides: list[int]
     sh_degree: int
@@ -51,15 +51,15 @@ class ModelMetadata:
     checkpoint_sha256: str
     # Version of idesplat that exported it.
     version: str
-    # Whether it yields Gaussians, as all models before this field did, or depth alone.
+    # Whether it predicts Gaussians, as all models did before this field, or depth only.
     gaussians: bool = True
-    # What the parts that bear it compute in: float32, int8 or fp16. Inputs, outputs and geometry are always in float32.
+    # float32, int8 or fp16, for the layers that tolerate it. Inputs, outputs and geometry are always float32.
     precision: str = "float32"
     conventions: str = CONVENTIONS
     layout: int = LAYOUT
 
     def to_json(self) -> str:
-        """The metadata property."""
+        """The value of the metadata property."""
         return json.dumps(asdict(self))
 
 
@@ -73,19 +73,19 @@ class StageFile:
     outputs: list[str]
 
 
-_SIDE, _VIEWS = whole(1, LARGEST_SIDE), whole(1, MOST_VIEWS)
-_DESCRIPTION: dict[str, Check] = {
+_SIDE, _VIEWS = whole(1, MAX_SIDE), whole(1, MAX_VIEWS)
+_METADATA_CHECKS: dict[str, Check] = {
     "preset": string,
     "height": _SIDE,
     "width": _SIDE,
     "size_multiple": _SIDE,
     "fixed_size": flag,
-    "fixed_views": whole(0, MOST_VIEWS),
+    "fixed_views": whole(0, MAX_VIEWS),
     "near": distance,
     "far": distance,
     "trained_views": pair(_VIEWS),
     "trained_sides": pair(_SIDE),
-    "sh_degree": whole(0, HIGHEST_SH_DEGREE),
+    "sh_degree": whole(0, MAX_SH_DEGREE),
     "checkpoint": string,
     "checkpoint_sha256": string,
     "version": string,
@@ -103,28 +103,28 @@ def promised(metadata: ModelMetadata) -> Sequence[str]:
 
 
 def read_metadata(properties: dict[str, str], path: Path) -> ModelMetadata:
-    """The description in a model's metadata properties; raises InputError if it is none of ours, or damaged."""
+    """The metadata in a model's properties; raises InputError if the model is not of this project, or damaged."""
     if METADATA_KEY not in properties:
         lack = f"not a model of this project (no '{METADATA_KEY}' metadata)"
         raise InputError(f"{path}: {lack}; make one with idesplat-export")
     text = properties[METADATA_KEY]
     try:
-        if len(text) > MOST_BYTES:
-            raise InputError(f"{len(text)} characters, expected {MOST_BYTES} at most")
+        if len(text) > MAX_BYTES:
+            raise InputError(f"{len(text)} characters, expected {MAX_BYTES} at most")
         content = parse_object(text)
         layout = content.get("layout")
         if isinstance(layout, bool) or layout != LAYOUT:
             found = f"metadata layout {shown(layout)}, expected {LAYOUT}"
             raise InputError(f"{found}; export it again with this version")
-        description = ModelMetadata(**checked_fields(content, _DESCRIPTION, _ADDED_LATER))
-        _check_description(description)
+        metadata = ModelMetadata(**checked_fields(content, _METADATA_CHECKS, _ADDED_LATER))
+        _check_metadata(metadata)
     except InputError as error:
         raise InputError(f"{path}: damaged metadata: {error}; export it again") from None
-    return description
+    return metadata
 
 
-def _check_description(own: ModelMetadata) -> None:
-    """What the fields must be together."""
+def _check_metadata(own: ModelMetadata) -> None:
+    """Raise InputError where fields contradict each other."""
     if not own.near < own.far:
         raise InputError(f"near {own.near:g} and far {own.far:g}, expected near < far")
     if own.fixed_views == 1:
@@ -134,7 +134,7 @@ def _check_description(own: ModelMetadata) -> None:
 
 
 def write_manifest(folder: Path, stages: list[StageFile]) -> None:
-    """Write the list of a staged folder's graphs, in the order in which they run."""
+    """Write the manifest of a staged folder: its graphs in the order in which they run."""
     content = {"format": MANIFEST_FORMAT, "layout": LAYOUT, "stages": [asdict(stage) for stage in stages]}
     (folder / MANIFEST_NAME).write_text(json.dumps(content, indent=2) + "\n")
 
@@ -144,28 +144,28 @@ def read_manifest(folder: Path) -> list[StageFile]:
     path = folder / MANIFEST_NAME
     if not path.exists():
         raise InputError(f"{folder}: no {MANIFEST_NAME}, expected a folder made by idesplat-export --staged")
-    content = read_bytes(path, "the manifest of a staged folder", MOST_BYTES)
+    content = read_bytes(path, "the manifest of a staged folder", MAX_BYTES)
     try:
         stages = _stages(parse_object(content))
         for stage in stages:
             if Path(stage.file).name != stage.file or not (folder / stage.file).is_file():
                 raise InputError(f"names {shown(stage.file)}, which is not in the folder")
         _check_order(stages)
-    except (InputError, ValueError, OSError) as error:  # of names that no file can have, the last two
+    except (InputError, ValueError, OSError) as error:  # the last two from names that no file can have
         raise InputError(f"{path}: damaged manifest: {error}; export it again") from None
     return stages
 
 
 def _stages(content: dict[str, object]) -> list[StageFile]:
-    """The entries of a manifest, each by itself as it should be."""
+    """The entries of a manifest, each checked by itself."""
     if content.get("format") != MANIFEST_FORMAT:
         raise InputError(f'format is {shown(content.get("format"))}, expected "{MANIFEST_FORMAT}"')
     layout = content.get("layout")
     if isinstance(layout, bool) or layout != LAYOUT:
         raise InputError(f"layout is {shown(layout)}, expected {LAYOUT}")
     entries = content.get("stages")
-    if not isinstance(entries, list) or not 1 <= len(entries) <= MOST_STAGES:
-        raise InputError(f"stages is {shown(entries)}, expected a list of 1 to {MOST_STAGES}")
+    if not isinstance(entries, list) or not 1 <= len(entries) <= MAX_STAGES:
+        raise InputError(f"stages is {shown(entries)}, expected a list of 1 to {MAX_STAGES}")
     stages = []
     for index, entry in enumerate(entries):
         try:
@@ -176,7 +176,7 @@ def _stages(content: dict[str, object]) -> list[StageFile]:
 
 
 def _check_order(stages: Sequence[StageFile]) -> None:
-    """Every stage has a name and a file of its own, reads what there is by then, and yields what there was not."""
+    """Check that names and files are unique, inputs are available by then, and outputs are new."""
     for values, what in (([stage.name for stage in stages], "name"), ([stage.file for stage in stages], "file")):
         if len(set(values)) < len(values):
             raise InputError(f"two stages have the same {what}")

@@ -1,8 +1,4 @@
-"""Values in the JSON of metadata and manifests, each checked for its type and range.
-
-JSON comes from a file that anybody may have written: a wrong type, a number beyond all reason or a million brackets are
-found here, and not where the value is used.
-"""
+"""Checks of type and range for the values in the JSON of metadata and manifests, which is not trusted."""
 
 import json
 import math
@@ -12,10 +8,10 @@ from typing import Any, NoReturn
 
 from ..errors import InputError
 
-LONGEST_STRING = 4096  # characters
-LONGEST_LIST = 256  # entries
+MAX_STRING = 4096  # characters
+MAX_LIST = 256  # entries
 
-Check = Callable[[object], Any]  # the value as it is to be used; raises InputError that says what was expected
+Check = Callable[[object], Any]  # returns the value to use; raises InputError with what was expected
 
 
 def parse_object(text: str | bytes) -> dict[str, Any]:
@@ -34,9 +30,9 @@ def parse_object(text: str | bytes) -> dict[str, Any]:
 
 
 def checked_fields(content: object, checks: dict[str, Check], optional: frozenset[str] = frozenset()) -> dict[str, Any]:
-    """The fields of a JSON object that `checks` names, each as its check returns it; others are left alone.
+    """The fields of a JSON object that `checks` names, each as its check returns it; others are ignored.
 
-    Raises InputError naming the field that is missing or not as it should be.
+    Raises InputError naming the field that is missing or invalid.
     """
     if not isinstance(content, dict):
         raise InputError(f"{shown(content)}, expected a JSON object")
@@ -54,7 +50,7 @@ def checked_fields(content: object, checks: dict[str, Check], optional: frozense
 
 def string(value: object) -> str:
     """A string of text."""
-    if not isinstance(value, str) or len(value) > LONGEST_STRING:
+    if not isinstance(value, str) or len(value) > MAX_STRING:
         raise InputError("a string")
     return value
 
@@ -88,14 +84,14 @@ def distance(value: object) -> float:
 
 
 def pair(check: Check) -> Check:
-    """A check for two values in rising order, such as the fewest and the most."""
+    """A check for two values in ascending order, such as a minimum and a maximum."""
 
     def check_pair(value: object) -> list[Any]:
         if not isinstance(value, list) or len(value) != 2:
             raise InputError("a list of two numbers")
         first, second = (check(part) for part in value)
         if first > second:
-            raise InputError("a list of two numbers in rising order")
+            raise InputError("a list of two numbers in ascending order")
         return [first, second]
 
     return check_pair
@@ -103,7 +99,7 @@ def pair(check: Check) -> Check:
 
 def names(value: object) -> list[str]:
     """A list of different strings."""
-    fits = isinstance(value, list) and len(value) <= LONGEST_LIST and all(isinstance(name, str) for name in value)
+    fits = isinstance(value, list) and len(value) <= MAX_LIST and all(isinstance(name, str) for name in value)
     if not isinstance(value, list) or not fits or len(set(value)) < len(value):
         raise InputError("a list of different names")
     return [string(name) for name in value]

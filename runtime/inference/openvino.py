@@ -1,6 +1,6 @@
-"""OpenVINO as an execution provider, which runs a graph on the processor as a program of its own.
+"""OpenVINO as an execution provider on Intel CPUs.
 
-It comes as a plug-in to ONNX Runtime, in a package of its own (the extra `openvino`).
+It is a plug-in of ONNX Runtime in a separate package (extra `openvino`).
 """
 
 import functools
@@ -14,19 +14,19 @@ from ..errors import InputError
 
 PROVIDER = "OpenVINOExecutionProvider"
 PACKAGE = "onnxruntime_ep_openvino"
-# Left alone it computes in bfloat16 where a processor is quick at that, and depths move by more than half.
+# By default it computes in bfloat16 on CPUs with bfloat16 instructions, which changes depths by more than half.
 PRECISION = "f32"
 
 
 def installed() -> bool:
-    """Whether the plug-in is there."""
+    """Whether the plug-in is installed."""
     return find_spec(PACKAGE) is not None
 
 
 def add_openvino(options: onnxruntime.SessionOptions) -> None:
-    """Have the sessions opened with these options run on OpenVINO in float32, on as many threads as they say.
+    """Let sessions opened with these options run on OpenVINO in float32, with the options' number of threads.
 
-    Raises InputError where the plug-in cannot be loaded, or finds no processor that it runs on.
+    Raises InputError where the plug-in cannot be loaded, or supports no CPU of this machine.
     """
     settings = {"INFERENCE_PRECISION_HINT": PRECISION}
     if options.intra_op_num_threads:
@@ -36,18 +36,18 @@ def add_openvino(options: onnxruntime.SessionOptions) -> None:
     except Exception as error:  # ONNX Runtime raises many kinds, all derived from Exception alone
         reason = str(error).split(" : ")[-1].splitlines()[0]
         raise InputError(f"OpenVINO's plug-in cannot be loaded ({reason}); use --provider CPU") from None
-    devices = [device for device in onnxruntime.get_ep_devices() if _is_processor(device)]
+    devices = [device for device in onnxruntime.get_ep_devices() if _is_cpu(device)]
     if not devices:
-        raise InputError("OpenVINO's plug-in runs on Intel's processors alone, and finds none here; use --provider CPU")
+        raise InputError("OpenVINO's plug-in runs on Intel CPUs only, and finds none here; use --provider CPU")
     options.add_provider_for_devices(devices[:1], {"load_config": json.dumps({"CPU": settings})})
 
 
 @functools.cache
 def _register() -> None:
-    """Load the plug-in, which ONNX Runtime takes once in a process."""
+    """Register the plug-in, which ONNX Runtime accepts once per process."""
     onnxruntime.register_execution_provider_library(PROVIDER, import_module(PACKAGE).get_library_path())
 
 
-def _is_processor(device: onnxruntime.OrtEpDevice) -> bool:
-    """Whether it is the processor as OpenVINO itself runs on it, and not through one of its pseudo-devices."""
+def _is_cpu(device: onnxruntime.OrtEpDevice) -> bool:
+    """Whether the device is the CPU itself, not one of OpenVINO's virtual devices."""
     return device.ep_name == PROVIDER and device.device.type == onnxruntime.OrtHardwareDeviceType.CPU

@@ -189,7 +189,7 @@ def test_infer_never_replaces_what_it_reads(workplace, capfd, name, overwrite):
 @pytest.mark.parametrize("way", [as_names_without_suffix, as_own_json_elsewhere])
 def test_infer_never_replaces_photographs_that_only_the_cameras_name(dataset, capfd, way, option):
     cameras, _ = way(dataset)
-    given = ["--cameras", cameras, "--out", "new.ply", "--near", "1", "--far", "9"]  # the carried model
+    given = ["--cameras", cameras, "--out", "new.ply", "--near", "1", "--far", "9"]  # the bundled model
     assert "would replace an image" in refused(capfd, dataset, infer, *given, *option, "--overwrite")
 
 

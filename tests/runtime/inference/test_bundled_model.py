@@ -1,4 +1,4 @@
-"""The carried model: whole, small, described, and better than a guess."""
+"""The bundled model: complete, small, documented, and better than a constant depth."""
 
 import numpy as np
 import pytest

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from idesplat import InputError, Predictor
 from idesplat.runtime.inference.metadata import (
     MANIFEST_NAME,
+    MAX_STAGES,
     METADATA_KEY,
-    MOST_STAGES,
     StageFile,
     read_manifest,
     read_metadata,
@@ -159,7 +159,7 @@ BAD_MANIFESTS = {
     "another layout": ({**changed(), "layout": 2}, "layout is 2"),
     "a flag for the layout": ({**changed(), "layout": True}, "layout is True"),
     "no stages": ({**changed(), "stages": []}, "expected a list of 1 to"),
-    "too many stages": ({**changed(), "stages": [asdict(STAGES[0])] * (MOST_STAGES + 1)}, "1 to 32"),
+    "too many stages": ({**changed(), "stages": [asdict(STAGES[0])] * (MAX_STAGES + 1)}, "1 to 32"),
     "a file elsewhere": (changed(file="../first.onnx"), "not in the folder"),
     "an absolute file": (changed(file="/dev/zero"), "not in the folder"),
     "a NUL in a name": (changed(file="a\x00b"), "damaged manifest"),

@@ -170,7 +170,7 @@ def test_a_model_that_cannot_be_loaded_leaves_nothing(cache, tmp_path):
 @pytest.mark.parametrize(
     ("where", "name", "value"),
     [
-        (graph_cache, "_processor", lambda: "another processor"),
+        (graph_cache, "_cpu", lambda: "another CPU"),
         (onnxruntime, "__version__", "99.0"),
         (graph_cache, "LAYOUT", 2),
     ],
@@ -200,7 +200,7 @@ def test_weights_in_other_files_are_never_stale(cache, tmp_path):
 
 
 def test_very_large_models_are_not_kept(cache, model, monkeypatch):
-    monkeypatch.setattr(graph_cache, "LARGEST_MODEL", model.stat().st_size - 1)
+    monkeypatch.setattr(graph_cache, "MAX_MODEL_BYTES", model.stat().st_size - 1)
     assert cache_entry(model) is None
 
 
@@ -209,7 +209,7 @@ def test_the_cache_stays_small_and_keeps_what_is_used(cache, tmp_path, monkeypat
     for model in models[:2]:
         open_session(model)
     size = max(path.stat().st_size for path in entries(cache))
-    monkeypatch.setattr(graph_cache, "LARGEST_CACHE", 2 * size + 100)
+    monkeypatch.setattr(graph_cache, "MAX_CACHE_BYTES", 2 * size + 100)
     open_session(models[0])  # now the second is the one that was not used for longest
     open_session(models[2])
     kept = [cache_entry(model).get() is not None for model in models]

@@ -57,9 +57,9 @@ def test_it_is_chosen_by_name(name, monkeypatch):
 @pytest.mark.parametrize(
     "others", [(), (device("CPUExecutionProvider", "CPU"), device("OpenVINOExecutionProvider.AUTO", "CPU"))]
 )
-def test_without_a_processor_that_it_takes_it_is_refused(others, found, exported):
+def test_without_a_supported_cpu_it_is_refused(others, found, exported):
     found(*others)
-    with pytest.raises(InputError, match=r"^OpenVINO's plug-in runs on Intel's processors alone, .* --provider CPU$"):
+    with pytest.raises(InputError, match=r"^OpenVINO's plug-in runs on Intel CPUs only, .* --provider CPU$"):
         Predictor(exported[0], "OpenVINO")
 
 
@@ -73,7 +73,7 @@ def test_a_plug_in_that_cannot_be_loaded_is_refused_in_one_line(monkeypatch, exp
 
 
 @pytest.mark.parametrize("threads", [0, 3])
-def test_it_computes_in_float32_on_the_processor(threads, found):
+def test_it_computes_in_float32_on_the_cpu(threads, found):
     """Where it is quick at bfloat16 it would take that, left alone."""
     wanted = device(openvino.PROVIDER, "CPU")
     found(device("CPUExecutionProvider", "CPU"), device(openvino.PROVIDER, "GPU"), wanted)
