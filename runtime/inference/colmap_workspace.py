@@ -1,4 +1,4 @@
-"""Depth maps as a dense workspace of COLMAP, as if its patch_match_stereo had made them.
+"""Depth maps as a dense workspace of COLMAP, in the layout of its patch_match_stereo.
 
     images/                     the images at the size of the depth maps, undistorted
     sparse/                     cameras.bin, images.bin, points3D.bin
@@ -6,8 +6,8 @@
     stereo/normal_maps/         normals in the camera's frame, towards the camera, *.geometric.bin
     stereo/patch-match.cfg, stereo/fusion.cfg
 
-`colmap stereo_fusion --workspace_path DIR --output_path fused.ply` and `pycolmap.stereo_fusion` make one point cloud of
-it. Which images overlap is told by the points in sparse/, which are pixels whose depth at least two views agree about.
+`colmap stereo_fusion --workspace_path DIR --output_path fused.ply` and `pycolmap.stereo_fusion` fuse it to a point
+cloud. The points in sparse/, pixels on whose depth at least two views agree, tell which images overlap.
 """
 
 import struct
@@ -27,10 +27,10 @@ from ..system.files import atomic_write, make_folder
 from ..views.batch import ViewBatch
 from .predictor import Prediction
 
-PINHOLE = 1  # COLMAP's number of this camera model
-POINTS_A_VIEW = 1000  # in sparse/, about
-FEWEST_SIGHTS = 2  # of a point
-SOURCES = "__auto__, 20"  # COLMAP's own choice of the images to match with
+PINHOLE = 1  # COLMAP's id of this camera model
+POINTS_PER_VIEW = 1000  # in sparse/, about
+MIN_TRACK_LENGTH = 2  # observations of a point
+SOURCES = "__auto__, 20"  # COLMAP chooses the source images
 GEOMETRIC = ".geometric.bin"
 OFFSET_FILE = "offset.txt"
 SPARSE_FILES = ("cameras.bin", "images.bin", "points3D.bin")
@@ -47,10 +47,10 @@ def workspace_files(folder: Path, stems: Sequence[str]) -> list[Path]:
 
 
 def write_workspace(folder: Path, stems: Sequence[str], prediction: Prediction, views: ViewBatch) -> list[Path]:
-    """Write a dense workspace into an existing folder; the paths written.
+    """Write a dense workspace into an existing folder; returns the paths written.
 
     stems: the images' names without suffix, all different, [views]. views: what was predicted from; what was
-    subtracted from the user's world coordinates stands in `offset.txt`, unless it is zero.
+    subtracted from the user's world coordinates is written to `offset.txt`, unless it is zero.
     Raises InputError if a file cannot be written.
     """
     names = [f"{stem}.png" for stem in stems]
@@ -95,7 +95,7 @@ def normals_of(depth: np.ndarray, K: np.ndarray) -> np.ndarray:
 
 
 def _write_array(path: Path, values: np.ndarray) -> None:
-    """COLMAP's form of a map [channels, height, width]: its size as text, then float32 values, channel by channel."""
+    """COLMAP's file format of a map [channels, height, width]: its size as text, then float32 values by channel."""
     channels, height, width = values.shape
     with atomic_write(path) as temporary:
         temporary.write_bytes(f"{width}&{height}&{channels}&".encode() + values.astype("<f4").tobytes())
@@ -105,21 +105,21 @@ def _write_array(path: Path, values: np.ndarray) -> None:
 
 
 def _write_sparse(folder: Path, names: Sequence[str], prediction: Prediction, views: ViewBatch) -> list[Path]:
-    """cameras.bin, images.bin and points3D.bin, one camera for each image; the paths written."""
-    points, colours, sights = _sparse_points(prediction, views)
-    # Every sight is an entry of its image's list, in which the points' tracks give their places.
-    places = np.where(sights, np.cumsum(sights, axis=0) - 1, -1)  # [points, views]
+    """Write cameras.bin, images.bin and points3D.bin, one camera for each image; returns the paths written."""
+    points, colours, observed = _sparse_points(prediction, views)
+    # Every observation is an entry of its image's list; the points' tracks hold indices into these lists.
+    list_indices = np.where(observed, np.cumsum(observed, axis=0) - 1, -1)  # [points, views]
     cameras_bin, images_bin, points_bin = SPARSE_FILES
     content = {
         cameras_bin: _packed([_camera_record(index, camera) for index, camera in enumerate(prediction.cameras, 1)]),
         images_bin: _packed(
             [
-                _image_record(index + 1, name, camera, points, np.flatnonzero(sights[:, index]))
+                _image_record(index + 1, name, camera, points, np.flatnonzero(observed[:, index]))
                 for index, (name, camera) in enumerate(zip(names, prediction.cameras, strict=True))
             ]
         ),
         points_bin: _packed(
-            [_point_record(index, points[index], colours[index], places[index]) for index in range(len(points))]
+            [_point_record(index, points[index], colours[index], list_indices[index]) for index in range(len(points))]
         ),
     }
     for name, data in content.items():
@@ -129,19 +129,19 @@ def _write_sparse(folder: Path, names: Sequence[str], prediction: Prediction, vi
 
 
 def _sparse_points(prediction: Prediction, views: ViewBatch) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Some pixels as points that views agree about: world [points, 3], RGB uint8 [points, 3], seen [points, views]."""
+    """Pixels on whose depth views agree: world points [points, 3], RGB uint8 [points, 3], observed [points, views]."""
     depth, extrinsics, intrinsics = prediction.depth, views.extrinsics, views.intrinsics.astype(np.float64)
     count, height, width = depth.shape
-    step = max(1, round((height * width / POINTS_A_VIEW) ** 0.5))
+    step = max(1, round((height * width / POINTS_PER_VIEW) ** 0.5))
     rows, columns = (part.ravel() for part in np.mgrid[step // 2 : height : step, step // 2 : width : step])
     points = unproject(depth, extrinsics, intrinsics)[:, rows, columns].reshape(-1, 3)
     colours = to_uint8(views.images[:, :, rows, columns]).transpose(0, 2, 1).reshape(-1, 3)
-    sights = np.zeros((len(points), count), bool)
+    observed = np.zeros((len(points), count), bool)
     for view in range(count):
         pixel, z, inside = project_to_view(points, (height, width), extrinsics[view], intrinsics[view])
-        sights[:, view] = inside & (np.abs(depth[view].ravel()[pixel] - z) < DEPTH_TOLERANCE * z)
-    agreed = sights.sum(axis=1) >= FEWEST_SIGHTS
-    return points[agreed], colours[agreed], sights[agreed]
+        observed[:, view] = inside & (np.abs(depth[view].ravel()[pixel] - z) < DEPTH_TOLERANCE * z)
+    agreed = observed.sum(axis=1) >= MIN_TRACK_LENGTH
+    return points[agreed], colours[agreed], observed[agreed]
 
 
 def _packed(records: Sequence[bytes]) -> bytes:
@@ -155,7 +155,7 @@ def _camera_record(number: int, camera: Camera) -> bytes:
 
 
 def _image_record(number: int, name: str, camera: Camera, points: np.ndarray, seen: np.ndarray) -> bytes:
-    """An image, its pose world-to-camera, and where it sees which of the points."""
+    """An image, its pose world-to-camera, and the pixels at which it observes points."""
     pose = invert_rigid(camera.extrinsics)
     (quat,) = matrices_to_quaternions(pose[None, :3, :3])
     local = points[seen] @ pose[:3, :3].T + pose[:3, 3]
@@ -166,8 +166,8 @@ def _image_record(number: int, name: str, camera: Camera, points: np.ndarray, se
     return start + struct.pack("<Q", len(seen)) + table.tobytes()
 
 
-def _point_record(index: int, point: np.ndarray, colour: np.ndarray, places: np.ndarray) -> bytes:
-    """A point with its track: images and places [views] in their lists, negative where it is not seen."""
-    views = np.flatnonzero(places >= 0)
-    track = np.stack([views + 1, places[views]], axis=1).astype("<i4")
+def _point_record(index: int, point: np.ndarray, colour: np.ndarray, list_indices: np.ndarray) -> bytes:
+    """A point with its track. list_indices: indices in the images' lists [views], negative where not observed."""
+    views = np.flatnonzero(list_indices >= 0)
+    track = np.stack([views + 1, list_indices[views]], axis=1).astype("<i4")
     return struct.pack("<Q3d3BdQ", index + 1, *point, *colour.tolist(), 0.0, len(views)) + track.tobytes()

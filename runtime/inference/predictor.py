@@ -1,4 +1,4 @@
-"""The pipeline as a library: a model file or staged folder, arrays in, depth and Gaussians out."""
+"""Prediction with an exported model: images and cameras in, depth and Gaussians out."""
 
 import time
 from collections.abc import Sequence
@@ -32,24 +32,24 @@ class Prediction:
 
     depth: np.ndarray
     gaussians: Gaussians | None
-    # Seconds by stage; a fused file is one stage called "model".
+    # Seconds by stage; a single file is one stage called "model".
     seconds: dict[str, float] = field(default_factory=dict)
     cameras: list[Camera] = field(default_factory=list)
 
     def need_gaussians(self) -> Gaussians:
-        """The Gaussians, for what cannot do without them; raises InputError if there are none."""
+        """The Gaussians; raises InputError if the model predicts depth only."""
         if self.gaussians is None:
-            raise InputError("this model predicts depth alone; give one that predicts Gaussians, too")
+            raise InputError("this model predicts depth only; give one that predicts Gaussians, too")
         return self.gaussians
 
 
 class Predictor:
-    """An exported model, ready to run.
+    """An exported model, loaded.
 
     model: a `.onnx` of this project, a folder that `idesplat-export --staged` wrote, or what `read_model` returns.
     provider: an ONNX Runtime execution provider, such as CPU or CUDA.
-    config: threads and profiling, for those who measure.
-    Raises InputError if the model is not ours or damaged, or the provider is not there.
+    config: threads and profiling.
+    Raises InputError if the model is not of this project or damaged, or the provider is not installed.
     """
 
     def __init__(self, model: Path | str | ModelFiles, provider: str = CPU, config: SessionConfig = DEFAULT) -> None:
@@ -68,7 +68,7 @@ class Predictor:
 
     @property
     def metadata(self) -> ModelMetadata:
-        """What the model was trained with and yields."""
+        """The model's metadata."""
         return self.model.metadata
 
     def predict(
@@ -79,12 +79,12 @@ class Predictor:
         far: float | None = None,
         size: tuple[int, int] | None = None,
     ) -> Prediction:
-        """Predict depth and Gaussians from photographs of any size.
+        """Predict depth and Gaussians from images of any size.
 
         images: files, or RGB [h, w, 3], as uint8 in 0 to 255 or as floating point in [0, 1], which is rounded to 8 bits
-        as files have them. cameras: one for each image, as `read_cameras` gives them.
-        near, far: scene units; as `depth_range` finds them where not given. size: height and width to work at.
-        Raises InputError for anything that cannot be used.
+        as files have them. cameras: one for each image, as `read_cameras` gives them. near, far: scene units; estimated
+        by `depth_range` where not given. size: height and width to which the images are cropped and resized; the
+        trained size by default. Raises InputError for images or cameras that cannot be used.
         """
         if len(images) != len(cameras):
             raise InputError(f"{len(images)} images and {len(cameras)} cameras, expected one camera for each image")
@@ -99,14 +99,14 @@ class Predictor:
     def predict_views(self, views: ViewBatch, near: float | None = None, far: float | None = None) -> Prediction:
         """Predict depth and Gaussians from views as `build_view_batch` makes them.
 
-        near, far: scene units; as `depth_range` finds them where not given.
-        Raises InputError for anything the model cannot take.
+        near, far: scene units; estimated by `depth_range` where not given.
+        Raises InputError for views that the model does not take.
         """
         span = self.depth_range(views, near, far)
         return self._predict(views.images, views.extrinsics, views.intrinsics, span.near, span.far, views.names)
 
     def depth_range(self, views: ViewBatch, near: float | None = None, far: float | None = None) -> DepthRange:
-        """Near and far for these views, and where they come from; what is given stays.
+        """Near and far for these views, and their source; values that are given are kept.
 
         Raises InputError if near is not before far.
         """
@@ -125,14 +125,12 @@ class Predictor:
     ) -> Prediction:
         """Predict depth and Gaussians from arrays at a size that the model takes.
 
-        images: RGB in [0, 1], floating point. extrinsics: camera-to-world, OpenCV axes, in any unit.
-        intrinsics: row 0 divided by the width, row 1 by the height; pixel centres at .5.
-        near, far: in the unit of the poses, one number or one for each view. What is not given is found, from points
-        matched between the views or from their baseline, as `depth_range` does. It is never the range of the model's
-        training, which is of no meaning in another unit.
-        The network works in a normalised frame and unit (`SceneNormalization`): a scene in any unit gives the same
-        result, in that unit.
-        Raises InputError for anything the model cannot take.
+        images: RGB in [0, 1], floating point. extrinsics: camera-to-world, OpenCV axes, in any unit. intrinsics: row 0
+        divided by the width, row 1 by the height; pixel centres at .5. near, far: in the unit of the poses, one number
+        or one for each view; estimated by `depth_range` where not given, from points matched between the views or from
+        their baseline. The range in training does not apply: its unit is another. The network works in a normalised
+        frame and unit (`SceneNormalization`): a scene in any unit gives the same result, in that unit. Raises
+        InputError for arrays that the model does not take.
         """
         check_view_arrays(images, extrinsics, intrinsics, near, far)
         self.model.check_size(len(images), *np.shape(images)[2:])
@@ -189,7 +187,7 @@ class Predictor:
             raise InputError(f"{model.path}: no stage yields {missing[0]}; export it again")
 
     def end_profiling(self) -> list[Path]:
-        """Stop noting operators, where `config.profile` asked for it; the files of notes, one for each stage."""
+        """Stop profiling, if `config.profile` was given; returns the profiles, one file for each stage."""
         return [Path(session.end_profiling()) for session in self._sessions]
 
     def _run(self, values: dict[str, np.ndarray], frame: SceneNormalization) -> Prediction:
@@ -212,14 +210,14 @@ class Predictor:
 
 
 def _profiled(config: SessionConfig, stage: StageFile) -> SessionConfig:
-    """`config` with a file of notes of the stage's own."""
+    """`config` with a profile of the stage's own."""
     if config.profile is None:
         return config
     return replace(config, profile=config.profile.with_name(f"{config.profile.name}-{stage.name}"))
 
 
 def _last_uses(stages: list[StageFile]) -> list[set[str]]:
-    """For each stage, the tensors that are still needed after it: later stages' inputs, or the last one's outputs."""
+    """For each stage, the tensors that are needed after it: inputs of later stages, or outputs of the last."""
     needed = set(stages[-1].outputs)
     keep = []
     for stage in reversed(stages):

@@ -1,4 +1,4 @@
-"""ONNX Runtime sessions: providers checked, threads and memory set from measurement, runs with a time limit."""
+"""ONNX Runtime sessions: provider checks, thread and memory settings, runs with a time limit."""
 
 import os
 import re
@@ -22,13 +22,13 @@ CPU = "CPUExecutionProvider"
 FATAL_ONLY = 4
 AS_MANY_AS_CORES = 0  # threads
 SUFFIX = "ExecutionProvider"
-# The longest that a graph may run, so that one that never ends is ended: several times what the slowest of the networks
-# takes on one core of a slow machine.
-LONGEST_RUN_S = 900.0
-LONGEST_RUN_S_PER_PIXEL = 2e-3  # of all views together
-LIMIT_VARIABLE = "IDESPLAT_RUN_LIMIT"  # in the environment: seconds, instead of both
-LONGEST_REASON = 300  # characters of ONNX Runtime's messages that are quoted
-# What its messages begin with: a source file, a line and a function.
+# Time limit of a run, so that a graph with an endless loop is stopped: several times what the slowest network takes on
+# one core of a slow machine.
+RUN_LIMIT_S = 900.0
+RUN_LIMIT_S_PER_PIXEL = 2e-3  # of all views together
+LIMIT_VARIABLE = "IDESPLAT_RUN_LIMIT"  # environment variable: seconds, instead of both
+MAX_REASON = 300  # characters of ONNX Runtime's messages that are quoted
+# The prefix of its messages: source file, line and function.
 SOURCE = re.compile(r"^\S+\.(?:cc|h):\d+ .*?\) ")
 OUT_OF_MEMORY = ("Failed to allocate memory", "bad_alloc", "bad allocation", "out of memory")
 
@@ -36,7 +36,10 @@ onnxruntime.set_default_logger_severity(FATAL_ONLY)
 
 
 def provider_name(provider: str) -> str:
-    """`cuda`, `CUDA` or `CUDAExecutionProvider` -> the last; raises InputError naming what is installed."""
+    """The full name of a provider given as `cuda`, `CUDA` or `CUDAExecutionProvider`.
+
+    Raises InputError naming what is installed.
+    """
     wanted = provider.removesuffix(SUFFIX).lower()
     if wanted == openvino.PROVIDER.removesuffix(SUFFIX).lower():
         if not openvino.installed():
@@ -52,13 +55,13 @@ def provider_name(provider: str) -> str:
 
 @dataclass(frozen=True)
 class SessionConfig:
-    """How sessions are opened, for those who measure; everyone else does best with the defaults."""
+    """How sessions are opened. The defaults are right but for benchmarks and profiling."""
 
-    # None: as many as the process may use.
+    # None for all cores that the process may use.
     threads: int | None = None
-    # The beginning of the name of a file in which ONNX Runtime notes the time and the shapes of every operator.
+    # Prefix of the file to which ONNX Runtime writes the time and the shapes of every operator; None for no profile.
     profile: Path | None = None
-    # False runs the graph as it stands in the file.
+    # Whether ONNX Runtime optimises the graph.
     optimise: bool = True
 
 
@@ -68,11 +71,11 @@ DEFAULT = SessionConfig()
 def open_session(
     model: Path | bytes, provider: str = CPU, config: SessionConfig = DEFAULT
 ) -> onnxruntime.InferenceSession:
-    """Load a graph on one execution provider, given by its full name, as `provider_name` gives it.
+    """Load a graph, from a file or its bytes, on one execution provider, given by its full name (`provider_name`).
 
-    On the CPU a file's optimised graph is kept for the next time (see `graph_cache`).
+    On the CPU a file's optimised graph is cached (`graph_cache`).
     Raises InputError if the file cannot be loaded, if ONNX Runtime silently fell back to another provider, or if
-    OpenVINO has no processor to run on.
+    OpenVINO supports no CPU of this machine.
     """
     if isinstance(model, Path):
         with suppress(OSError):  # ONNX Runtime says that there is no such file
@@ -100,7 +103,7 @@ def open_session(
 
 
 def usable_cores() -> int:
-    """How many processor cores this process may run on."""
+    """The number of CPU cores that this process may run on."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -109,20 +112,22 @@ def usable_cores() -> int:
 def _options(config: SessionConfig) -> onnxruntime.SessionOptions:
     options = onnxruntime.SessionOptions()
     options.log_severity_level = FATAL_ONLY
-    # Its planning is quadratic in the number of nodes: without it a session opens ten times faster, and a run takes
-    # neither longer nor more memory, because the arena reuses buffers all the same.
+    # The planning of reuse is quadratic in the number of nodes. Without it a session opens ten times faster, and a run
+    # takes neither more time nor more memory, because the arena reuses buffers anyway.
     options.enable_mem_reuse = False
-    # From a first run it would learn one block for all of the next, and keep the first's memory besides: half as much
-    # again, for no time.
+    # The memory pattern would allocate one block for later runs beside the first run's memory: half as much again, for
+    # no gain in time.
     options.enable_mem_pattern = False
-    # Left alone, ONNX Runtime 1.31 pins a thread to every core, also to those that the process was told to keep off.
+    # By default ONNX Runtime 1.31 pins a thread to every core, also to those outside the process's affinity mask.
     restricted = usable_cores() < (os.cpu_count() or 1)
     options.intra_op_num_threads = config.threads or (usable_cores() if restricted else AS_MANY_AS_CORES)
     if config.profile is not None:
         options.enable_profiling, options.profile_file_prefix = True, str(config.profile)
     if not config.optimise:
         options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
-        options.add_session_config_entry("session.disable_prepacking", "1")  # else a profile misses weights' shapes
+        options.add_session_config_entry(
+            "session.disable_prepacking", "1"
+        )  # else a profile lacks the shapes of weights
     return options
 
 
@@ -130,20 +135,20 @@ def _create(
     model: Path | bytes, options: onnxruntime.SessionOptions, provider: str = CPU
 ) -> onnxruntime.InferenceSession:
     source = model if isinstance(model, bytes) else str(model)
-    providers = None if provider == openvino.PROVIDER else [provider]  # a plug-in is named in the options
+    providers = None if provider == openvino.PROVIDER else [provider]  # a plug-in is given in the options
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of a provider that is not there, which `open_session` raises for
         return onnxruntime.InferenceSession(source, options, providers=providers)
 
 
 def _open_cached(model: Path, options: onnxruntime.SessionOptions) -> onnxruntime.InferenceSession | None:
-    """A session of the optimised graph, which is kept if it was not yet; None where that does not work out."""
+    """A session of the cached optimised graph, which is added to the cache if missing; None where that fails."""
     entry = cache_entry(model)
     if entry is None:
         return None
 
-    def optimise(kept: Path) -> onnxruntime.InferenceSession:
-        options.optimized_model_filepath = str(kept)
+    def optimise(target: Path) -> onnxruntime.InferenceSession:
+        options.optimized_model_filepath = str(target)
         return _create(model, options)
 
     found = entry.get()
@@ -152,7 +157,7 @@ def _open_cached(model: Path, options: onnxruntime.SessionOptions) -> onnxruntim
             return entry.put(optimise)
         options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
         return _create(found, options)
-    except Exception:  # a damaged model, a full disk: opening the model itself says what is wrong, if anything is
+    except Exception:  # a damaged model or a full disk: opening the model itself raises the error, if it is the model's
         if found is not None:
             entry.evict(found)
         return None
@@ -167,11 +172,11 @@ def run_session(
     outputs: Sequence[str] | None = None,
     limit_s: float | None = None,
 ) -> dict[str, np.ndarray]:
-    """Run a graph on the feeds that it takes, and return its outputs, or those named, by name.
+    """Run a graph and return its outputs, or those named, by name. Feeds that are not its inputs are ignored.
 
-    limit_s: seconds after which the run is ended; None for no limit. It is ended between two operators: one that never
-    ends by itself cannot be.
-    Raises InputError if an input is missing, the graph cannot run on these feeds, or it did not end in time.
+    limit_s: seconds after which the run is stopped; None for no limit. It is stopped between two operators: an operator
+    that does not end cannot be.
+    Raises InputError if an input is missing, the graph cannot run on these feeds, or it exceeds the limit.
     """
     missing = [entry.name for entry in session.get_inputs() if entry.name not in feeds]
     if missing:
@@ -184,7 +189,7 @@ def run_session(
     watchdog = _watchdog(options, ended, limit_s)
     try:
         found = session.run(names, wanted, options)
-    except Exception as error:  # of many kinds, as above; also where memory runs out
+    except Exception as error:  # of many kinds, as above; also out of memory
         if ended.is_set():
             late = f"the graph did not end within {limit_s:g} s and was stopped"
             raise InputError(f"{late}; allow more by the environment variable {LIMIT_VARIABLE}=SECONDS") from None
@@ -196,10 +201,10 @@ def run_session(
 
 
 def run_limit_s(pixels: int) -> float:
-    """Seconds that a graph may run on views of so many pixels together; raises InputError for a limit that is none."""
+    """The time limit in seconds for so many pixels of all views; raises InputError for an invalid LIMIT_VARIABLE."""
     given = os.environ.get(LIMIT_VARIABLE)
     if given is None:
-        return LONGEST_RUN_S + LONGEST_RUN_S_PER_PIXEL * pixels
+        return RUN_LIMIT_S + RUN_LIMIT_S_PER_PIXEL * pixels
     try:
         limit = float(given)
     except ValueError:
@@ -210,7 +215,7 @@ def run_limit_s(pixels: int) -> float:
 
 
 def _watchdog(options: onnxruntime.RunOptions, ended: threading.Event, limit_s: float | None) -> threading.Timer | None:
-    """A thread that has the run with these options end once its time is over."""
+    """A timer that stops the run with these options after the limit; None for no limit."""
     if limit_s is None:
         return None
 
@@ -219,17 +224,17 @@ def _watchdog(options: onnxruntime.RunOptions, ended: threading.Event, limit_s: 
         options.terminate = True
 
     timer = threading.Timer(limit_s, end)
-    timer.daemon = True  # a command that is interrupted does not wait for it
+    timer.daemon = True  # an interrupted command does not wait for it
     timer.start()
     return timer
 
 
 def _reason(error: Exception) -> str:
-    """ONNX Runtime's message in one line, without status codes and places in its source code."""
+    """ONNX Runtime's message in one line, without status codes and source locations."""
     text = " ".join(str(error).split())
     _, found, message = text.partition("Status Message: ")
     reason = SOURCE.sub("", message if found else text.split(" : ")[-1])
-    return reason if len(reason) <= LONGEST_REASON else reason[:LONGEST_REASON] + "..."
+    return reason if len(reason) <= MAX_REASON else reason[:MAX_REASON] + "..."
 
 
 def _remedy(error: Exception) -> str:

@@ -1,1 +1,1 @@
-"""Pages that show a scene in the browser."""
+"""Scenes in the browser, and the report of an inference."""

@@ -1,8 +1,8 @@
-"""What a server on this machine owes its user: a port that is free, and no answer to other people's pages.
+"""A free port for the viewer's server, and protection against requests from other web pages.
 
-Any page that a browser shows may send requests to this machine. The browser says where they come from (`Origin`) and
-what name they were addressed to (`Host`). A page that connects to a server other than its own has another origin. A
-page whose name its owner lets point to this machine (DNS rebinding) has its own origin, but a name that is not ours.
+Any page in a browser may send requests to this machine. The headers `Origin` and `Host` hold where a request comes from
+and which name it is addressed to. A page of another server has another origin. With DNS rebinding, where an attacker
+lets their name resolve to this machine, the origin fits, but the name is not one of this machine's.
 """
 
 import contextlib
@@ -25,9 +25,9 @@ LOCAL_NAME = "localhost"
 
 
 def free_port(host: str, port: int) -> int:
-    """The first port from `port` on that can be served at; 0, for any, stays 0.
+    """The first free port from `port` on; 0, for any, stays 0.
 
-    Raises InputError if the host is none of this machine's, or no port is free.
+    Raises InputError if the host is not an address of this machine, or no port is free.
     """
     if not host:
         raise InputError("--host is empty; expected an address such as 127.0.0.1, or 0.0.0.0 for all of this machine's")
@@ -47,18 +47,18 @@ def free_port(host: str, port: int) -> int:
 
 
 def address(host: str, port: int) -> str:
-    """The page's address for a browser on this machine."""
+    """The URL of the page for a browser on this machine."""
     name = f"[{host}]" if ":" in host else host
-    if _is_unspecified(host):  # all of this machine's, of which a browser takes one
+    if _is_unspecified(host):  # all addresses of this machine: a browser needs one
         name = "[::1]" if ":" in host else "127.0.0.1"
     return f"http://{name}:{port}"
 
 
 @contextlib.contextmanager
 def only_own_page(host: str) -> Iterator[None]:
-    """Let a websockets server that is started in the block, at `host`, answer to its own page alone.
+    """Let a websockets server that is started in the block, at `host`, answer only its own page.
 
-    viser starts one and leaves no other way to check who asks. Raises RuntimeError if none was started.
+    viser starts one and has no other hook for checking requests. Raises RuntimeError if none was started.
     """
     import websockets.asyncio.server as server
 
@@ -75,13 +75,13 @@ def only_own_page(host: str) -> Iterator[None]:
     finally:
         server.serve = original  # type: ignore[misc]
     if not started:
-        raise RuntimeError("this version of viser serves in another way, which is not guarded")
+        raise RuntimeError("this version of viser starts another server, which is not protected")
 
 
 def is_own_page(host: str, asked: str | None, origin: str | None) -> bool:
-    """Whether a request is addressed to a server at `host`, and comes from nowhere else than its page.
+    """Whether a request is addressed to a server at `host` and comes from its own page.
 
-    asked, origin: the request's headers `Host` and `Origin`. Of a request without origin, only the first is judged.
+    asked, origin: the request's headers `Host` and `Origin`. Without an origin only the host is checked.
     """
     if asked is None or not _is_own_name(host, asked):
         return False
@@ -90,7 +90,7 @@ def is_own_page(host: str, asked: str | None, origin: str | None) -> bool:
 
 def _guarded(host: str, answer: Callable[..., Any] | None) -> "Callable[[ServerConnection, Request], Any]":
     def process_request(connection: "ServerConnection", request: "Request") -> "Response | Any":
-        """Refuse what does not come from the page; the page's own WebSocket always has an origin."""
+        """Answer 403 to requests from other pages; the page's own WebSocket always has an origin."""
         asked, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
         upgrade = "Upgrade" in request.headers
         single = len(asked) == 1 and len(origins) <= 1 and (origins or not upgrade)
@@ -102,7 +102,7 @@ def _guarded(host: str, answer: Callable[..., Any] | None) -> "Callable[[ServerC
 
 
 def _try_port(host: str, port: int) -> None:
-    """Bind a port at every address of the host, as serving does; raises OSError, UnicodeError."""
+    """Bind a port at every address of the host, as the server does; raises OSError, UnicodeError."""
     with contextlib.ExitStack() as stack:
         for family, kind, protocol, _, place in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
             bound = stack.enter_context(socket.socket(family, kind, protocol))
@@ -114,7 +114,7 @@ def _try_port(host: str, port: int) -> None:
 
 
 def _is_own_name(host: str, asked: str) -> bool:
-    """Whether a `Host` header can only mean this machine: a number, localhost, or the name that is served at."""
+    """Whether a `Host` header names this machine: an IP address, localhost, or the name given by --host."""
     try:
         name = urlsplit(f"//{asked}").hostname
     except ValueError:

@@ -1,7 +1,7 @@
-"""A scene, the cameras and their photographs in viser's browser page, served or as one file (extra `view`).
+"""A scene, the cameras and their images in viser's browser page, served or as one file (extra `view`).
 
-The page has a frame of its own, in which lengths suit its half-precision covariances, clipping planes and controls:
-the world's axes, the origin where the page's camera starts, and `DISTANCE` from there to what it looks at.
+The page's frame has the world's axes, its origin at the first camera, and a scale in which what that camera looks at is
+`DISTANCE` away: lengths that suit viser's half-precision covariances, clipping planes and controls.
 """
 
 import contextlib
@@ -30,15 +30,15 @@ if TYPE_CHECKING:
 INSTALL = 'pip install "idesplat[view]"'
 LOOPBACK = "127.0.0.1"
 DISTANCE = 10.0
-LARGEST_SCALE = 200.0  # whose square half precision still holds
-SIZE = (720, 1280)  # of the view of a scene without cameras: height and width
-FRUSTUM_DEPTH = 0.4  # from a camera to its photograph
-# Within this nothing is shown, so that the first camera's photograph and its neighbours' do not hide what it saw.
+LARGEST_SCALE = 200.0  # whose square is still finite in half precision
+SIZE = (720, 1280)  # height and width of the overview of a scene without cameras
+FRUSTUM_DEPTH = 0.4  # from a camera to its image
+# The near plane: the images of the first camera and its neighbours must not hide the scene.
 NEAR = 1.0
-PHOTOGRAPH_SIDE = 512  # pixels, of the longer side
+IMAGE_SIDE = 512  # pixels, of the longer side
 LINE = 0.005
-# Chromium runs no module worker from a blob of a page that was opened as a file, and viser 1.1 sorts its splats in one.
-# Where such a worker cannot be made at all, viser's page makes it from a data address instead, and that one runs.
+# Chromium does not run module workers from blobs in pages opened as files, and viser 1.1 sorts its splats in one. If
+# the constructor of such a worker throws, viser's page creates it from a data URL instead, which works.
 WORKERS_IN_FILES = """<script>
 window.Worker = class extends Worker {
   constructor(url, options) {
@@ -50,7 +50,7 @@ window.Worker = class extends Worker {
 
 
 class Viewpoint(NamedTuple):
-    """A camera without distortion, and what it took, uint8 RGB [height, width, 3], if that is to be shown."""
+    """A camera without distortion, and its image, uint8 RGB [height, width, 3], if it is to be shown."""
 
     camera: Camera
     photograph: np.ndarray | None
@@ -60,11 +60,11 @@ class Viewpoint(NamedTuple):
 def serving(
     gaussians: Gaussians, viewpoints: Sequence[Viewpoint], host: str, port: int
 ) -> Iterator["viser.ViserServer"]:
-    """A server of the page for as long as the block runs; port 0 for any that is free, else `port` or the next free.
+    """A server of the page while the block runs; port 0 for any that is free, else `port` or the next free one.
 
-    No other page may connect (see `serving`). The page starts at the first viewpoint or, without any, where the whole
-    scene is seen. A click at another viewpoint leads there.
-    Raises InputError if viser is not installed, the place cannot be served at, or there is nothing to see.
+    Other pages cannot connect (`server.only_own_page`). The page starts at the first viewpoint or, without any, at an
+    overview of the scene. A click on a viewpoint moves the camera there.
+    Raises InputError if viser is not installed, host or port cannot be used, or there is nothing to see.
     """
     first = viewpoints[0].camera if viewpoints else overview_camera(gaussians, *SIZE)
     unit = DISTANCE / focus_depth(gaussians, first)
@@ -75,7 +75,7 @@ def serving(
         if viewpoints:
             server.initial_camera.near = NEAR
         _add_gaussians(server, gaussians, first.extrinsics[:3, 3], unit)
-        _add_viewpoints(server, [_moved(view, first.extrinsics[:3, 3], unit) for view in viewpoints])
+        _add_viewpoints(server, [_to_page_frame(view, first.extrinsics[:3, 3], unit) for view in viewpoints])
         yield server
     finally:
         with _quiet():
@@ -83,9 +83,9 @@ def serving(
 
 
 def standalone_page(gaussians: Gaussians, viewpoints: Sequence[Viewpoint]) -> str:
-    """The page with everything in it as one HTML document, which needs no server and no network.
+    """The page and the scene as one HTML document, which needs no server and no network.
 
-    It holds the Gaussians at 32 bytes each, compressed, in base64, and viser's own page, 0.8 MB.
+    It holds the Gaussians with 32 bytes each, compressed, in base64, and viser's own page, 0.8 MB.
     Raises InputError as `serving` does.
     """
     with serving(gaussians, viewpoints, LOOPBACK, 0) as server:
@@ -104,21 +104,21 @@ def _start(host: str, port: int) -> "viser.ViserServer":
 
 
 def _quiet() -> contextlib.redirect_stdout[io.StringIO]:
-    """Without viser's banner and farewell."""
+    """Suppress what viser prints."""
     return contextlib.redirect_stdout(io.StringIO())
 
 
 def _place_camera(server: "viser.ViserServer", first: Camera, cameras: Sequence[Camera]) -> None:
-    """Let the page begin with what the first camera sees, and turn about the axis that points up in all of them."""
+    """Start the page at the first camera, with the mean up direction of the cameras as its orbit axis."""
     right, forward = first.extrinsics[:3, 0], first.extrinsics[:3, 2]
     up = -np.mean([camera.extrinsics[:3, 1] for camera in cameras], axis=0)
-    if np.linalg.norm(up) < 0.1:  # cameras that stand on their heads beside others that do not
+    if np.linalg.norm(up) < 0.1:  # some cameras are upside down
         up = -first.extrinsics[:3, 1]
     server.scene.set_up_direction(up)
     start = server.initial_camera
     start.position = np.zeros(3)
     start.look_at = DISTANCE * forward
-    # of all directions that leave the first camera's picture upright, the one nearest to the common one
+    # the direction nearest to `up` among those that keep the first camera's image upright
     start.up = up - (up @ right) * right
     if start.up @ first.extrinsics[:3, 1] >= 0:
         start.up = -first.extrinsics[:3, 1]
@@ -126,7 +126,7 @@ def _place_camera(server: "viser.ViserServer", first: Camera, cameras: Sequence[
 
 
 def _add_gaussians(server: "viser.ViserServer", gaussians: Gaussians, origin: np.ndarray, unit: float) -> None:
-    """Without the part of their colours that changes with the direction, which the page cannot show."""
+    """Add the Gaussians with the colours of SH degree 0: viser does not show view-dependent colour."""
     axes = quaternions_to_matrices(gaussians.quats) * np.minimum(unit * gaussians.scales, LARGEST_SCALE)[:, None]
     server.scene.add_gaussian_splats(
         "/Gaussians",
@@ -137,7 +137,7 @@ def _add_gaussians(server: "viser.ViserServer", gaussians: Gaussians, origin: np
     )
 
 
-def _moved(view: Viewpoint, origin: np.ndarray, unit: float) -> Viewpoint:
+def _to_page_frame(view: Viewpoint, origin: np.ndarray, unit: float) -> Viewpoint:
     """The viewpoint in the page's frame."""
     extrinsics = view.camera.extrinsics.copy()
     extrinsics[:3, 3] = unit * (extrinsics[:3, 3] - origin)
@@ -145,20 +145,20 @@ def _moved(view: Viewpoint, origin: np.ndarray, unit: float) -> Viewpoint:
 
 
 def _add_viewpoints(server: "viser.ViserServer", viewpoints: Sequence[Viewpoint]) -> None:
-    """Frusta, with photographs where there are any; a click at one leads the page's camera there."""
+    """Add frusta, with images where there are any; a click on one moves the page's camera there."""
     cameras = [view.camera for view in viewpoints]
     for index, view in enumerate(viewpoints):
-        _add_frustum(server, index, view).on_click(partial(_stand_there, view.camera, cameras))
+        _add_frustum(server, index, view).on_click(partial(_move_to, view.camera, cameras))
 
 
 def _add_frustum(server: "viser.ViserServer", index: int, view: Viewpoint) -> "viser.CameraFrustumHandle":
-    camera, photograph = view
+    camera, image = view
     fov = _field_of_view(camera)
     aspect = camera.width / camera.K[0, 0] * camera.K[1, 1] / camera.height
-    if photograph is not None:
-        factor = min(1, PHOTOGRAPH_SIDE / max(photograph.shape[:2]))
-        photograph = cv2.resize(photograph, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
-    # viser's scale is that of a pyramid of volume 4 / 9, whatever its angles
+    if image is not None:
+        factor = min(1, IMAGE_SIDE / max(image.shape[:2]))
+        image = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    # viser scales a pyramid of volume 4 / 9, whatever its angles
     scale = FRUSTUM_DEPTH * float(np.cbrt(math.tan(fov / 2) ** 2 * aspect / 3))
     return server.scene.add_camera_frustum(
         f"/photographs/{index} {PurePosixPath(camera.name).name}",
@@ -166,7 +166,7 @@ def _add_frustum(server: "viser.ViserServer", index: int, view: Viewpoint) -> "v
         aspect,
         scale=scale,
         thickness=LINE,
-        image=photograph,
+        image=image,
         wxyz=matrices_to_quaternions(camera.extrinsics[None, :3, :3])[0],
         position=camera.extrinsics[:3, 3],
         cast_shadow=False,
@@ -174,10 +174,10 @@ def _add_frustum(server: "viser.ViserServer", index: int, view: Viewpoint) -> "v
     )
 
 
-def _stand_there(clicked: Camera, cameras: Sequence[Camera], click: "viser.SceneNodePointerEvent") -> None:
-    """Move the page's camera to the one that was clicked at.
+def _move_to(clicked: Camera, cameras: Sequence[Camera], click: "viser.SceneNodePointerEvent") -> None:
+    """Move the page's camera to the viewpoint that was clicked.
 
-    viser takes the first on the pointer's way, which may be the unseen one that the page's camera stands at.
+    viser picks the first along the ray, which may be the hidden one at the page's own camera.
     """
     start, direction = np.array(click.ray_origin), np.array(click.ray_direction)
     distances = [_distance(camera, start, direction) for camera in cameras]
@@ -195,7 +195,7 @@ def _stand_there(clicked: Camera, cameras: Sequence[Camera], click: "viser.Scene
 
 
 def _distance(camera: Camera, start: np.ndarray, direction: np.ndarray) -> float:
-    """How far along a ray, from `start` [3] in a `direction` [3], a camera's photograph is; NaN if it is not met."""
+    """Distance along a ray, from `start` [3] in `direction` [3], to a camera's image; NaN if the ray misses it."""
     rotation, position = camera.extrinsics[:3, :3], camera.extrinsics[:3, 3]
     start, direction = (start - position) @ rotation, direction @ rotation  # in the camera's frame
     distance = (FRUSTUM_DEPTH - start[2]) / direction[2] if direction[2] else math.nan
@@ -204,5 +204,5 @@ def _distance(camera: Camera, start: np.ndarray, direction: np.ndarray) -> float
 
 
 def _field_of_view(camera: Camera) -> float:
-    """From top to bottom, in radians, as if the principal point were in the middle."""
+    """Vertical field of view in radians, for a principal point in the middle."""
     return 2 * math.atan(camera.height / 2 / camera.K[1, 1])

@@ -187,7 +187,7 @@ def test_names_of_this_machine():
 
 
 def test_a_server_that_cannot_be_guarded_is_not_used():
-    with pytest.raises(RuntimeError, match="not guarded"), only_own_page("127.0.0.1"):
+    with pytest.raises(RuntimeError, match="not protected"), only_own_page("127.0.0.1"):
         pass
 
 
