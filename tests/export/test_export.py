@@ -116,7 +116,7 @@ def test_fixed_views_and_size(small_checkpoint, presets, tmp_path, capsys):
     assert "fixed.onnx" in capsys.readouterr().out
 
 
-def test_a_departing_graph_leaves_no_file(small_checkpoint, presets, tmp_path, monkeypatch, capsys):
+def test_a_mismatching_graph_leaves_no_file(small_checkpoint, presets, tmp_path, monkeypatch, capsys):
     mismatch = TensorError(
         "2 views", "encoder", "encoder.features_mv", ErrorQuantiles(1, 2, 3), ErrorQuantiles(1, 2, 2), 3.0
     )
@@ -128,7 +128,7 @@ def test_a_departing_graph_leaves_no_file(small_checkpoint, presets, tmp_path, m
 
 
 def test_verification_notices_a_wrong_graph(exported):
-    """The very comparison that guards the export fails when the weights differ by one part in ten of one tensor."""
+    """The comparison fails when the weights of one tensor differ by a tenth."""
     from idesplat.export.stages import NamedTensors, Stage
     from idesplat.export.tracing import StaticShape
     from idesplat.export.validation.compare import Exported, verify

@@ -37,7 +37,7 @@ STAGES = {
 
 
 def network(name):
-    """A tiny network with weights that matter: drawn as for the references."""
+    """A small network with random weights as in the reference cases."""
     model = build(NETWORKS[name]).eval()
     drawn = {key: random_tensor(key, tuple(value.shape), seed=1, gain=1.0) for key, value in model.state_dict().items()}
     model.load_state_dict({key: torch.from_numpy(np.array(value, np.float32)) for key, value in drawn.items()})

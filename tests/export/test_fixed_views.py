@@ -20,7 +20,7 @@ INFER = (*USUAL, "--out", "scene.ply")
 
 @pytest.fixture(autouse=True)
 def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Five photographs, their cameras and a model for three views, and we stand there."""
+    """Change to a folder with five images, their cameras and a model for three views."""
     monkeypatch.chdir(tmp_path)
     Path("images").mkdir()
     rng = np.random.default_rng(0)
@@ -57,7 +57,7 @@ def test_another_number_is_refused(
     assert not Path("scene.ply").exists()
 
 
-def test_too_few_photographs_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+def test_too_few_images_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_command(main, "--images", "images/000.png", "images/001.png", *INFER) == 2
     assert "model.onnx was exported for 3 views and got 2; give 3" in capsys.readouterr().err
 

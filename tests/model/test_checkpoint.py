@@ -134,7 +134,7 @@ def test_a_missing_file_and_a_file_without_tensors(tmp_path):
         read_state_dict(tmp_path / "empty.ckpt")
 
 
-# ---- what no checkpoint holds: each refused in one line, with no exception but CheckpointError
+# ---- invalid contents: each is refused in one line, by CheckpointError
 
 
 def _replaced(value):

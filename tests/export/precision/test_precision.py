@@ -44,7 +44,7 @@ def test_inputs_and_outputs_stay_in_float32(lowered):
     assert elements == dict.fromkeys((*INPUTS, *OUTPUTS), TensorProto.FLOAT)
 
 
-def test_only_the_parts_that_bear_it_are_in_it(lowered):
+def test_only_quantizable_layers_are_converted(lowered):
     precision, out, _ = lowered
     graph = onnx.load(out).graph
     if precision == "int8":

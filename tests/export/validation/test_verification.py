@@ -1,4 +1,4 @@
-"""The verification that guards an export: what it compares, and that each kind of fault is caught in either form."""
+"""Verification of exports: what it compares, and that each kind of fault is caught in fused and staged graphs."""
 
 import shutil
 
@@ -229,7 +229,7 @@ def test_a_sound_export_passes_by_far(exported, cases):
     assert max(max(error.ratios) for error in errors) < 0.5
 
 
-# ---- the figures
+# ---- error quantiles
 
 
 def figures(found, expected, views=2):
@@ -241,7 +241,7 @@ def depth():
     return np.random.default_rng(0).standard_normal((4, 40, 60)).astype(np.float32)
 
 
-def test_a_figure_is_that_of_the_worst_view(depth):
+def test_quantiles_are_those_of_the_worst_view(depth):
     found = depth.copy()
     found[2] += 3 * depth.std()
     assert figures(found, depth, 4) == pytest.approx((3, 3, 3), rel=1e-3)
@@ -315,7 +315,7 @@ ERRORS = [
 ]
 
 
-def test_the_table_has_one_line_a_stage_with_the_figure_that_counts(capsys):
+def test_the_summary_has_one_line_a_stage_with_the_worst_quantile(capsys):
     print_summary(ERRORS)
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("│")]
     assert len(lines) == 2
@@ -325,7 +325,7 @@ def test_the_table_has_one_line_a_stage_with_the_figure_that_counts(capsys):
     assert cells == [FUSED, "1", "depth", "room, 2 views", "99.9 %", "5.0e-03", "1.0e-02", "ok"]
 
 
-def test_the_whole_table_has_every_figure_beside_its_bound(capsys):
+def test_the_details_have_every_quantile_beside_its_bound(capsys):
     print_details(ERRORS)
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("│")]
     assert len(lines) == 3
@@ -382,7 +382,7 @@ def test_the_files_that_are_written_are_those_that_were_verified(
 
 
 @pytest.mark.parametrize("damaged", ("model.onnx", "encoder.onnx"))
-def test_a_weight_that_hardly_matters_is_compared_too(
+def test_a_weight_of_little_effect_is_compared_too(
     damaged, small_checkpoint, without_tracing, tmp_path, monkeypatch, capsys
 ):
     """One weight is off by a rounding step, which no output shows."""

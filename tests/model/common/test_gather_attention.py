@@ -1,4 +1,4 @@
-"""The sparse products that training and the export put in place of the network's own: the same values and gradients."""
+"""The gather attention of training and of exported graphs has the network's own values and gradients."""
 
 import numpy as np
 import onnx

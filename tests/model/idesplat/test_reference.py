@@ -87,7 +87,7 @@ def test_monocular_disparity_matches_up_to_its_scale(case):
 
 @pytest.mark.parametrize("stage", (1, 2, 3))
 @pytest.mark.parametrize("name", ("inverse_depth_first", "inverse_depth"))
-def test_units_match(case, stage, name):
+def test_dpbus_match(case, stage, name):
     ours, reference, _ = compare(case, f"stage{stage}.{name}")
     assert share_within(ours, reference, 1e-3 * reference) >= 0.995
     assert ((ours - reference).abs() / reference).median() < 5e-5
@@ -95,7 +95,7 @@ def test_units_match(case, stage, name):
 
 @pytest.mark.parametrize("stage", (1, 2, 3))
 @pytest.mark.parametrize("name", ("features", "probability"))
-def test_unit_features_match(case, stage, name):
+def test_dpbu_features_match(case, stage, name):
     ours, reference, deviation = compare(case, f"stage{stage}.{name}")
     assert (ours - reference).abs().median() < 2e-3 * deviation
     assert share_within(ours, reference, 5e-2 * deviation) >= 0.98
