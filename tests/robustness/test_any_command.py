@@ -172,7 +172,7 @@ def good(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     torch.save({"state_dict": {"encoder.a": torch.ones(3)}}, folder / "last.ckpt")
     torch.save([as_scene(scene, "a")], folder / "chunks" / "0.torch")
     (folder / "index.json").write_text(json.dumps({"a": {"context": [0, 4], "target": [1]}}))
-    (folder / "rows.json").write_text(json.dumps({"machine": {}, "rows": []}))
+    (folder / "rows.json").write_text(json.dumps({"version": 2, "machine": {}, "rows": []}))
     (folder / "notes.ply").write_text("the user's own")
     return folder
 

@@ -189,7 +189,7 @@ def targets(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
     document = JSON(captures.CAPTURES_FILE.read_text())
     document["captures"] = document["captures"][:1]
     found.append(Target("captures.json", json.dumps(document).encode(), read_capture_file, document))
-    rows = {"machine": {}, "rows": [asdict(Row("m", "p", "float32", "CPU", 2, 32, 48, seconds=[1.0]))]}
+    rows = {"version": 2, "machine": {}, "rows": [asdict(Row("m", "p", "float32", "CPU", 2, 32, 48, seconds=[1.0]))]}
     found.append(Target("rows.json", json.dumps(rows).encode(), read_rows, rows))
 
     with pytest.MonkeyPatch.context() as patch:
