@@ -1,7 +1,7 @@
-"""The one exception that stands for "your input, not our code", and how a command ends.
+"""`InputError`, the exception for invalid input, and how commands report errors.
 
-Every message is one line that says what is wrong, where, what was expected and what to do. The commands
-print it without a traceback and exit with `EXIT_STATUS`; library users catch `InputError`.
+A message is one line: what is wrong, where, what was expected, and the remedy. Commands print it without a traceback
+and exit with `EXIT_STATUS`; library users catch `InputError`.
 """
 
 import contextlib
@@ -13,17 +13,17 @@ from pathlib import Path
 from typing import NoReturn
 
 EXIT_STATUS = 2
-SIGNALLED = 128  # a shell's exit status of a command that a signal ended is this and the signal's number
-BROKEN_PIPE = SIGNALLED + 13  # SIGPIPE, which Windows does not name
-MAX_ERROR_LENGTH = 2000  # characters: an option, or a name in a file, may have any length
+SIGNALLED = 128  # added to the signal's number in the exit status, as shells do
+BROKEN_PIPE = SIGNALLED + 13  # SIGPIPE, which is not defined on Windows
+MAX_ERROR_LENGTH = 2000  # characters; options and names in files can have any length
 
 
 class InputError(ValueError):
-    """Something the user gave cannot be used: a file, a camera, an option."""
+    """An input is invalid: a file, a camera, an option."""
 
 
 class Terminated(KeyboardInterrupt):
-    """A signal that asks the process to end: it cleans up as after Ctrl-C."""
+    """A signal that asks the process to end, raised as an exception so that it cleans up as after Ctrl-C."""
 
     def __init__(self, signal_number: int) -> None:
         super().__init__()
@@ -31,20 +31,20 @@ class Terminated(KeyboardInterrupt):
 
 
 def raise_input_error(path: Path, what: str, remedy: str) -> NoReturn:
-    """Raise InputError for a file: what is wrong with it, and what was expected or to do."""
+    """Raise InputError for a file: what is wrong, and what was expected or the remedy."""
     raise InputError(f"{path}: {what}; {remedy}")
 
 
 def printable(text: str) -> str:
     """The text with control characters, bidirectional overrides and lone surrogates as escapes, such as \\x1b.
 
-    Names of files and cameras may hold them, and a terminal would obey them. Line breaks and tabs are escaped, too.
+    Names of files and cameras can contain them, and a terminal would interpret them. Line breaks and tabs are escaped.
     """
     return "".join(character if _is_shown(character) else _escape(character) for character in text)
 
 
 def report_error(message: str) -> None:
-    """Print an error as one line on stderr, where that can be written; of a very long one, beginning and end."""
+    """Print an error as one line on stderr, if it is writable; the middle of a very long one is left out."""
     line = printable(" ".join(message.split()))
     if len(line) > MAX_ERROR_LENGTH:
         line = f"{line[: MAX_ERROR_LENGTH // 2]} ... {line[-MAX_ERROR_LENGTH // 2 :]}"
@@ -62,9 +62,9 @@ def _escape(character: str) -> str:
 
 @contextmanager
 def error_context(where: str) -> Iterator[None]:
-    """Put `where` (a file, a frame, a field) in front of the message of an InputError raised inside the block.
+    """Prefix the message of an InputError raised in the block with `where`: a file, a frame or a field.
 
-    Once only: what reads a whole file begins with its path, which may end in `where`, or lead through it.
+    Not if the message already begins with a path that contains `where`.
     """
     try:
         yield

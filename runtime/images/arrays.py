@@ -1,4 +1,4 @@
-"""Images that come as arrays: what their numbers mean is told by their type, or not at all."""
+"""Images given as arrays: the value range follows from the type."""
 
 import numpy as np
 
@@ -8,10 +8,10 @@ EXPECTED = "expected RGB [height, width, 3], as uint8 in 0 to 255 or as floating
 
 
 def as_uint8_image(image: np.ndarray, name: str) -> np.ndarray:
-    """RGB [height, width, 3], as uint8 or as floating point in [0, 1], as uint8.
+    """An RGB image [height, width, 3], uint8 or floating point in [0, 1], as uint8.
 
-    Raises InputError, naming the image, for other shapes, types and ranges: 12 bits in uint16, 0 to 255 in float32 or
-    [-1, 1] cannot be told apart from what they are not.
+    name: for messages. Raises InputError for other shapes, types and ranges, such as uint16, or float32 in [0, 255] or
+    [-1, 1], whose range would have to be guessed.
     """
     if image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
         raise InputError(f"{name}: an image of shape {image.shape}; {EXPECTED}")

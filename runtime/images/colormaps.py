@@ -2,7 +2,7 @@
 
 import numpy as np
 
-NEAREST_SHARE, FARTHEST_SHARE = 98, 2  # percentiles of inverse depth that get the ends of the colour map
+VMIN_PERCENTILE, VMAX_PERCENTILE = 2, 98  # of inverse depth
 
 
 def colormap_depth(depth: np.ndarray, limits: tuple[float, float] | None = None) -> np.ndarray:
@@ -23,10 +23,10 @@ def colormap_depth(depth: np.ndarray, limits: tuple[float, float] | None = None)
 
 
 def inverse_depth_range(depth: np.ndarray) -> tuple[float, float]:
-    """Inverse depths, of the far and the near end, beyond which 2 % of a depth map lie each."""
+    """vmin and vmax of a depth map's colours: the 2nd and 98th percentile of inverse depth; (0, 1) without depth."""
     known = _known(depth)
-    far, near = np.percentile(1 / depth[known], (FARTHEST_SHARE, NEAREST_SHARE)) if known.any() else (0.0, 1.0)
-    return float(far), float(near)
+    vmin, vmax = np.percentile(1 / depth[known], (VMIN_PERCENTILE, VMAX_PERCENTILE)) if known.any() else (0.0, 1.0)
+    return float(vmin), float(vmax)
 
 
 def _known(depth: np.ndarray) -> np.ndarray:
@@ -34,11 +34,11 @@ def _known(depth: np.ndarray) -> np.ndarray:
 
 
 def to_uint8(values: np.ndarray) -> np.ndarray:
-    """Numbers in [0, 1] as uint8, rounded."""
+    """Values in [0, 1] as uint8, clipped and rounded."""
     return np.rint(np.clip(values, 0, 1) * 255).astype(np.uint8)
 
 
 def srgb_to_linear(colours: np.ndarray) -> np.ndarray:
-    """Linear light, as glTF has it, for sRGB colours, as pictures have them; both in [0, 1], which is clipped to."""
+    """Linear RGB of sRGB colours (IEC 61966-2-1), both in [0, 1]; values outside are clipped."""
     clipped = np.clip(colours, 0, 1)
     return np.where(clipped <= 0.04045, clipped / 12.92, ((clipped + 0.055) / 1.055) ** 2.4)

@@ -1,4 +1,4 @@
-"""What the header of an image file says. Nothing is decoded, so that a size is known before memory is asked for."""
+"""Image headers: format, size and orientation, read without decoding, so that sizes are checked before allocation."""
 
 import logging
 import warnings
@@ -15,19 +15,19 @@ from ..errors import InputError
 from ..system.files import open_regular
 from ..system.limits import IMAGE_MEGAPIXELS
 
-# Pillow's names of what is read, whatever a file's suffix says.
+# The formats that are read, by Pillow's names, whatever the suffix.
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "JPEG2000", "AVIF", "PPM", "HEIF")
 HEIF = "HEIF"
 TIFF = "TIFF"
 TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 BIG_TIFF_HEADER, TIFF_HEADER = 16, 8  # bytes
-START = 16  # bytes that tell what a file is
+START = 16  # bytes that identify the format
 HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 # Tags of TIFF 6.0, and of EXIF 2.32.
 TIFF_WIDTH, TIFF_HEIGHT, TIFF_PHOTOMETRIC, TIFF_SAMPLES, ORIENTATION = 256, 257, 262, 277, 274
 PHOTOMETRIC_RGB = 2
 UPRIGHT = 1
-TRANSPOSED = (5, 6, 7, 8)  # orientations that swap width and height
+TRANSPOSED = (5, 6, 7, 8)  # EXIF orientations that swap width and height
 TRANSPARENT_MODES = ("RGBA", "LA", "PA", "La", "RGBa")
 
 logging.getLogger("PIL").addHandler(logging.NullHandler())  # otherwise it writes to stderr
@@ -43,7 +43,7 @@ class DamagedImage(InputError):
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """format: Pillow's name, or TIFF. width, height: pixels as they are stored, which `orientation` (EXIF) turns."""
+    """format: Pillow's name, or TIFF. width, height: as stored, before `orientation` (EXIF) is applied."""
 
     format: str
     width: int
@@ -59,7 +59,7 @@ class ImageHeader:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image file, upright, from its header alone; raises InputError as `read_header`."""
+    """Width and height of an image file, upright, from its header. Raises InputError as `read_header`."""
     path = Path(path)
     try:
         file = open_regular(path)
@@ -75,9 +75,9 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def read_header(path: Path, file: BinaryIO) -> ImageHeader:
-    """The header of an image whose content `file` holds from its beginning; the path is for messages.
+    """The header of the image in `file`, which is at its beginning; the path is for messages.
 
-    Raises DamagedImage if it is no image of a known format, InputError if it has more pixels than the limit.
+    Raises DamagedImage if it is not an image of a supported format, InputError if it has more pixels than the limit.
     """
     start = file.read(START)
     file.seek(0)
@@ -93,9 +93,9 @@ def read_header(path: Path, file: BinaryIO) -> ImageHeader:
 
 @contextmanager
 def open_image(path: Path, file: BinaryIO) -> Iterator[Image.Image]:
-    """The image that Pillow sees in `file`, not decoded, without any warning or limit of Pillow's.
+    """Open the image in `file` with Pillow, not decoded, without Pillow's warnings and size limit.
 
-    Raises DamagedImage, for whatever goes wrong inside the block, too.
+    Raises DamagedImage, also for errors inside the block.
     """
     start = file.read(START)
     file.seek(0)
@@ -103,23 +103,23 @@ def open_image(path: Path, file: BinaryIO) -> Iterator[Image.Image]:
         _register_heif(path)
     allowed = Image.MAX_IMAGE_PIXELS
     try:
-        Image.MAX_IMAGE_PIXELS = None  # our own limit names the variable that raises it
+        Image.MAX_IMAGE_PIXELS = None  # `check_megapixels` applies our own limit
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             with Image.open(file, formats=FORMATS) as image:
                 yield image
     except InputError:
         raise
-    except Exception as error:  # of damaged files Pillow makes many kinds
+    except Exception as error:  # Pillow raises many types for damaged files
         if isinstance(error, MemoryError):
             raise
-        raise DamagedImage(path, "is damaged or not an image that is read; save it as JPEG or PNG") from None
+        raise DamagedImage(path, "is damaged or not a supported image; save it as JPEG or PNG") from None
     finally:
         Image.MAX_IMAGE_PIXELS = allowed
 
 
 def read_exif(image: Image.Image) -> Image.Exif:
-    """The EXIF data of an image, empty where it has none; not of XMP, and without decoding, unlike `getexif`."""
+    """The EXIF data of an image, or empty; unlike `getexif`, without XMP and without decoding."""
     if image.format == TIFF:
         return image.getexif()
     exif, content = Image.Exif(), image.info.get("exif")
@@ -144,20 +144,20 @@ def _check_pixels(path: Path, width: int, height: int) -> None:
 
 
 def _orientation(image: Image.Image) -> int:
-    """What the EXIF data says of how the image is to be turned; 1 where it says nothing that is known."""
-    if image.format == HEIF:  # libheif turns images itself
+    """The EXIF orientation, 1 to 8; 1 if it is missing or invalid."""
+    if image.format == HEIF:  # libheif applies the orientation itself
         return UPRIGHT
     try:
         value = read_exif(image).get(ORIENTATION, UPRIGHT)
-    except Exception:  # damaged metadata; the image may be whole
+    except Exception:  # damaged metadata; the pixels may be valid
         return UPRIGHT
     return value if isinstance(value, int) and 1 <= value <= 8 else UPRIGHT
 
 
 def _read_tiff(path: Path, file: BinaryIO) -> ImageHeader:
-    """The header of a TIFF's first image. Pillow refuses pixel types that OpenCV reads, so its tags are read alone.
+    """The header of a TIFF's first image, from its tags, since Pillow rejects pixel types that OpenCV reads.
 
-    OpenCV turns a TIFF upright by itself.
+    OpenCV applies the orientation of a TIFF itself.
     """
     try:
         with warnings.catch_warnings():
@@ -172,7 +172,7 @@ def _read_tiff(path: Path, file: BinaryIO) -> ImageHeader:
             transparent = directory.get(TIFF_PHOTOMETRIC) == PHOTOMETRIC_RGB and directory.get(TIFF_SAMPLES) == 4
             if directory.get(ORIENTATION) in TRANSPOSED:
                 width, height = height, width
-    except Exception:  # of damaged files Pillow makes many kinds
+    except Exception:  # Pillow raises many types for damaged files
         raise DamagedImage(path, "is a damaged TIFF; save it as JPEG or PNG") from None
     return ImageHeader(TIFF, width, height, UPRIGHT, transparent)
 

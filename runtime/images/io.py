@@ -1,4 +1,4 @@
-"""Photographs: found, read upright as RGB, undistorted, and brought to the network's size with their intrinsics."""
+"""Finding image files, and reading them as upright 8-bit RGB."""
 
 import glob
 import os
@@ -15,25 +15,25 @@ from ..system.files import check_regular, read_bytes
 from .header import HEIF, DamagedImage, ImageHeader, open_image, read_header
 from .video_reader import SUFFIXES as VIDEO_SUFFIXES
 
-# Images that are read.
+# Supported formats.
 SUFFIXES = (
     *(".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".tif", ".tiff", ".bmp", ".jp2", ".avif", ".ppm", ".pgm"),
     *(".heic", ".heif", ".hif"),
 )
-# Images that are not: of a folder, they are named as left out.
+# Image formats that are not supported, whose files are reported when a folder holds them.
 UNSUPPORTED_SUFFIXES = (
     *(".gif", ".jxl", ".jxr", ".jpf", ".j2k", ".exr", ".hdr", ".psd", ".tga", ".svg", ".pbm", ".pnm", ".insp"),
     *(".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".sr2", ".raf", ".orf", ".rw2", ".pef", ".srw", ".raw"),
     *(".3fr", ".iiq", ".x3f"),
 )
 MAX_FILE_SIZE = 1 << 31  # bytes
-NAMED = 3  # files that a note names
+EXAMPLES = 3  # names listed in a message
 
 
 def find_images(given: Sequence[str | Path]) -> list[Path]:
-    """Return the images that folders, globs and files stand for, each once, sorted naturally (img2 before img10).
+    """The images in folders, globs and files, without duplicates, in natural order (img2 before img10).
 
-    Raises InputError if something given does not exist or is no image, or nothing is found.
+    Raises InputError if an input does not exist or is not an image, or if nothing is found.
     """
     found = [path for item in given for path in _images_of(item)]
     if not found:
@@ -42,32 +42,31 @@ def find_images(given: Sequence[str | Path]) -> list[Path]:
 
 
 def image_stem(path: PurePath) -> str:
-    """The name without an image's suffix; `r_0.5` has none."""
+    """The file name without the suffix of an image format; other suffixes, as in `r_0.5`, are kept."""
     return path.stem if path.suffix.lower() in SUFFIXES else path.name
 
 
 def unsupported_images(given: Sequence[str | Path]) -> list[Path]:
-    """The images of formats that are not read, by their suffix, that given folders and globs hold, sorted."""
+    """Images of unsupported formats, by suffix, in folders and globs, in natural order."""
     found = [path for item in given for path in _files_of(item) if _is_unread(path)]
     return sorted(set(found), key=_natural)
 
 
 def describe_unsupported(given: Sequence[str | Path]) -> list[str]:
-    """A line that names what `unsupported_images` finds; none where it finds nothing."""
+    """A note that names the `unsupported_images`, or none."""
     left = unsupported_images(given)
     if not left:
         return []
-    names = ", ".join(path.name for path in left[:NAMED]) + (", ..." if len(left) > NAMED else "")
+    names = ", ".join(path.name for path in left[:EXAMPLES]) + (", ..." if len(left) > EXAMPLES else "")
     count = "1 image is" if len(left) == 1 else f"{len(left)} images are"
-    return [f"{count} of a format that is not read, and left out: {names}; save as JPEG or PNG"]
+    return [f"{count} of an unsupported format, and left out: {names}; save as JPEG or PNG"]
 
 
 def load_image(path: Path) -> np.ndarray:
-    """Read an image as uint8 RGB, [height, width, 3], turned as its EXIF tag says; it is decoded once.
+    """Read an image as uint8 RGB [height, width, 3], upright by its EXIF orientation.
 
-    Grey becomes RGB, transparency is laid on white, 16 bits are scaled to 8.
-    Raises DamagedImage if it cannot be read, InputError if it has more pixels than the limit, which the header tells,
-    or holds floating-point values.
+    Grey becomes RGB, transparency is composited over white, 16 bits are scaled to 8.
+    Raises DamagedImage if it cannot be read, InputError if it exceeds the pixel limit or holds floating-point values.
     """
     try:
         content = read_bytes(path, "an image", MAX_FILE_SIZE)
@@ -76,7 +75,7 @@ def load_image(path: Path) -> np.ndarray:
     header = read_header(path, BytesIO(content))
     decoded = _decode(path, content, header)
     if decoded is None:
-        raise DamagedImage(path, "is damaged or not an image that is read; save it as JPEG or PNG")
+        raise DamagedImage(path, "is damaged or not a supported image; save it as JPEG or PNG")
     image = _eight_bits(decoded, path)
     if image.shape[:2] != (header.height, header.width):
         shape = f"{image.shape[1]} x {image.shape[0]}"
@@ -89,7 +88,7 @@ def load_image(path: Path) -> np.ndarray:
 
 
 def _images_of(item: str | Path) -> list[Path]:
-    """The images one argument stands for."""
+    """The images of one input."""
     path = Path(item)
     expected = f"expected {', '.join(SUFFIXES)}"
     files = _files_of(item)
@@ -108,7 +107,7 @@ def _images_of(item: str | Path) -> list[Path]:
 
 
 def _files_of(item: str | Path) -> list[Path]:
-    """The paths one argument stands for; a name that exists is never taken for a glob."""
+    """The paths of one input; an existing path is never taken for a glob."""
     path = Path(item)
     if path.is_dir():
         return list(path.iterdir())
@@ -125,19 +124,19 @@ def _is_unread(path: Path) -> bool:
 
 
 def _natural(path: Path) -> tuple[list[str | int], str]:
-    """Sort key in which digits count as numbers: text and numbers alternate, so that like is compared with like."""
+    """The key of natural sorting: text and numbers alternate, so that only values of one type are compared."""
     pieces = re.split(r"(\d+)", path.as_posix().casefold())
     return [int(piece) if index % 2 else piece for index, piece in enumerate(pieces)], path.as_posix()
 
 
 def _decode(path: Path, content: bytes, header: ImageHeader) -> np.ndarray | None:
-    """The pixels as they are stored, BGR or BGRA or grey, or None where they cannot be decoded."""
+    """The pixels as stored, BGR, BGRA or grey, or None if they cannot be decoded."""
     if header.format == HEIF:
         with open_image(path, BytesIO(content)) as image:
             mode = "RGBA" if header.transparent else "RGB"
             pixels = np.asarray(image.convert(mode))
         return cv2.cvtColor(pixels, cv2.COLOR_RGBA2BGRA if header.transparent else cv2.COLOR_RGB2BGR)
-    # Without transparency OpenCV is asked for colours, since it leaves some of TIFF's colour spaces as they are.
+    # IMREAD_UNCHANGED would not convert some of TIFF's colour spaces, so it is used for transparency only.
     colours = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         flags = cv2.IMREAD_UNCHANGED if header.transparent else colours
@@ -147,7 +146,7 @@ def _decode(path: Path, content: bytes, header: ImageHeader) -> np.ndarray | Non
 
 
 def _upright(image: np.ndarray, orientation: int) -> np.ndarray:
-    """The image [height, width, 3] turned as an EXIF orientation says: mirrored for 2, 4, 5 and 7."""
+    """The image [height, width, 3] with an EXIF orientation applied (2, 4, 5 and 7 mirror it)."""
     if orientation in (5, 6, 7, 8):
         image = image.transpose(1, 0, 2)
     rows = -1 if orientation in (3, 4, 7, 8) else 1

@@ -1,4 +1,4 @@
-"""Pictures out: colours and depth as 8-bit PNG files that appear whole or not at all."""
+"""Writing RGB images and depth maps as 8-bit PNG files, atomically."""
 
 from pathlib import Path
 
@@ -9,11 +9,11 @@ from .colormaps import colormap_depth, to_uint8
 
 
 def save_png(path: Path, rgb: np.ndarray) -> None:
-    """Write colours in [0, 1], [height, width, 3], as an 8-bit PNG; what lies outside is clipped.
+    """Write RGB in [0, 1], [height, width, 3], as an 8-bit PNG; values outside are clipped.
 
     Raises InputError if the file cannot be written.
     """
-    import cv2  # here, so that a command can say what it does without loading OpenCV
+    import cv2  # imported late, so that commands start without OpenCV
 
     _, encoded = cv2.imencode(".png", to_uint8(rgb)[..., ::-1])
     with atomic_write(path) as temporary:
@@ -21,7 +21,7 @@ def save_png(path: Path, rgb: np.ndarray) -> None:
 
 
 def save_depth_png(path: Path, depth: np.ndarray) -> None:
-    """Write depth in world units, [height, width], in the colours of `colormap_depth`.
+    """Write depth, [height, width], as `colormap_depth` renders it.
 
     Raises InputError if the file cannot be written.
     """

@@ -1,4 +1,4 @@
-"""Image sizes as commands are given them and as networks take them."""
+"""Image sizes: the option --size, and the sizes that a network accepts."""
 
 from ..errors import InputError
 from ..system.limits import SIDE_PIXELS, parse_whole_number
@@ -21,16 +21,16 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def is_valid_size(height: int, width: int, multiple: int) -> bool:
-    """Whether a network whose sizes go in steps of `multiple` takes this one."""
+    """Whether a network with this size multiple accepts the size."""
     return height % multiple == width % multiple == 0 and min(height, width) >= 2 * multiple
 
 
 def nearest_size(aspect: float, area: float, multiple: int) -> tuple[int, int]:
-    """Height and width in steps of `multiple`, with a quotient near `aspect` and a product near `area` in pixels."""
+    """Height and width, multiples of `multiple`, with about this aspect ratio (height / width) and area in pixels."""
     height, width = (multiple * max(2, round((area * side) ** 0.5 / multiple)) for side in (aspect, 1 / aspect))
     return height, width
 
 
 def describe_size_rule(multiple: int) -> str:
-    """What `is_valid_size` asks, in words."""
+    """The rule of `is_valid_size`, for messages."""
     return f"height and width must be multiples of {multiple} from {2 * multiple}"

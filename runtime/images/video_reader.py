@@ -1,6 +1,6 @@
-"""A video as photographs: sharp frames, evenly spaced, or those that cameras name, as PNG files.
+"""Extracting frames from videos as PNG files: sharp, evenly spaced frames, or the frames that cameras name.
 
-A frame's file is called after the video and the frame's number, `<video>-<number>.png`, numbers counted from 0.
+A file is named `<video>-<frame number>.png`, with frames numbered from 0.
 """
 
 import re
@@ -18,8 +18,8 @@ from .header import check_megapixels
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 FRAMES = 20
-CANDIDATES = 15  # frames looked at for each that is taken
-SHARPNESS_SIDE = 480  # pixels, at which sharpness is judged
+CANDIDATES = 15  # frames considered for each one that is extracted
+SHARPNESS_SIDE = 480  # pixels, at which sharpness is measured
 NUMBERED = re.compile(r"(.+)-(\d{6,})")
 
 
@@ -33,7 +33,7 @@ def extract_sharp_frames(video: Path, folder: Path) -> list[Path]:
 
     Raises InputError if the video cannot be read or has fewer than two frames.
     """
-    with working("looking for sharp frames"):
+    with working("selecting sharp frames"):
         sharpness = dict(_sharpness(video))
     if len(sharpness) < 2:
         raise InputError(f"{video}: has {len(sharpness)} frames that can be read, expected two at least")
@@ -43,17 +43,17 @@ def extract_sharp_frames(video: Path, folder: Path) -> list[Path]:
 
 
 def extract_named_frames(video: Path, names: Sequence[str], folder: Path) -> list[Path]:
-    """Write the frames that cameras name to a folder, FRAMES of them at most; the files are called as in `names`.
+    """Write the frames that cameras name to a folder, at most FRAMES, evenly spaced, under the names in `names`.
 
     A name is `<video>-<number>`, as `extract_sharp_frames` names files, or a time in microseconds, as in RealEstate10K.
     Raises InputError if the video cannot be read or no name is of these kinds.
     """
     rate = _frame_rate(video)
     name_of = {number: f"{_stem(name)}.png" for name in names if (number := _number(name, video, rate)) is not None}
-    if len(name_of) < min(2, len(names)):  # numbers of photographs may look like the first microseconds of it
+    if len(name_of) < min(2, len(names)):  # image numbers can look like timestamps of the first microseconds
         raise InputError(
             f"{video}: the cameras do not name its frames, such as {video.stem}-000000.png or a time in microseconds; "
-            "give the photographs that the cameras were made for, or --cameras estimate"
+            "give the images that the cameras were made for, or --cameras estimate"
         )
     spread = np.linspace(0, len(name_of) - 1, min(FRAMES, len(name_of))).round().astype(int)
     taken = [sorted(name_of)[index] for index in spread]
@@ -61,7 +61,7 @@ def extract_named_frames(video: Path, names: Sequence[str], folder: Path) -> lis
 
 
 def _write_frames(video: Path, name_of: Mapping[int, str], folder: Path) -> list[Path]:
-    """Write the frames of these numbers, under these names, to a folder; the files of those that exist, in order."""
+    """Write the frames with these numbers under these names; returns the files of the frames that exist, in order."""
     written = []
     for number, capture in _frames(video):
         if number in name_of:
@@ -87,14 +87,14 @@ def _sharpness(video: Path) -> Iterator[tuple[int, float]]:
 
 
 def _sharpness_of(frame: np.ndarray) -> float:
-    """Variance of the Laplacian of a small grey picture."""
+    """Variance of the Laplacian of the frame, reduced and in grey."""
     scale = min(1.0, SHARPNESS_SIDE / max(frame.shape[:2]))
     grey = cv2.resize(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     return float(cv2.Laplacian(grey, cv2.CV_32F).var())
 
 
 def _frames(video: Path) -> Iterator[tuple[int, cv2.VideoCapture]]:
-    """The number of each frame, with the capture from which it can be retrieved."""
+    """The number of each frame, and the capture to retrieve it from."""
     try:
         check_regular(video)
     except FileNotFoundError:
@@ -118,14 +118,14 @@ def _frames(video: Path) -> Iterator[tuple[int, cv2.VideoCapture]]:
 
 
 def _frame_rate(video: Path) -> float:
-    """Frames in a second, 0 where the video does not tell."""
+    """Frames per second, 0 if unknown."""
     for _, capture in _frames(video):
         return max(0.0, capture.get(cv2.CAP_PROP_FPS))
     return 0.0
 
 
 def _number(name: str, video: Path, rate: float) -> int | None:
-    """The number of the frame that a camera names, or None if it names none of this video's."""
+    """The number of the frame that a camera names, or None if the name is not of this video."""
     stem = _stem(name)
     numbered = NUMBERED.fullmatch(stem)
     if numbered and numbered[1] == video.stem:

@@ -1,7 +1,7 @@
-"""Videos out: H.264 in .mp4, which browsers, phones and editors play, written by PyAV (extra `video`).
+"""Writing videos as H.264 in .mp4 with PyAV (extra `video`), atomically.
 
-Whole or not at all; 4:2:0 chroma and BT.709 colours, as players expect; the index stands before the frames, so that
-playing can begin before all is loaded.
+4:2:0 chroma and BT.709 colours, which players expect; the index precedes the frames, so that playback can start while
+the file is loading.
 """
 
 from collections.abc import Callable, Iterator
@@ -22,27 +22,25 @@ if TYPE_CHECKING:
     from av.video.stream import VideoStream
 
 CODEC, PIXELS = "libx264", "yuv420p"
-CONSTANT_QUALITY = "18"  # x264's crf: hardly to be told from the original
+CONSTANT_QUALITY = "18"  # x264's crf: visually near lossless
 FAST_START = {"movflags": "+faststart"}
-LARGEST_DENOMINATOR = 1001  # of frames a second, such as 30000/1001
+LARGEST_DENOMINATOR = 1001  # of the frame rate, such as 30000/1001
 BT709, LIMITED_RANGE = 1, 1  # in the numbers of ITU-T H.273, and of FFmpeg's AVColorRange
 INSTALL = "pip install 'idesplat[video]'"
 
 
 def check_video_support() -> None:
-    """Raise InputError where no video can be written, because PyAV is not installed."""
+    """Raise InputError if PyAV is not installed."""
     if find_spec("av") is None:
-        raise InputError(
-            f"writing an .mp4 needs PyAV, which is not installed; {INSTALL}, or give a folder for pictures"
-        )
+        raise InputError(f"writing an .mp4 needs PyAV, which is not installed; {INSTALL}, or give a folder for images")
 
 
 @contextmanager
 def open_video(path: Path, width: int, height: int, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
     """Yield a function that adds a frame, RGB in [0, 1], [height, width, 3]; the video appears when the block ends.
 
-    A side that is odd gets its last pixels twice, since the codec takes even sides alone. Raises InputError if no video
-    can be written.
+    Odd sides are padded by repeating the last pixels, since the codec requires even sides. Raises InputError if the
+    video cannot be written.
     """
     check_video_support()
     import av

@@ -1,4 +1,4 @@
-"""Files: read only where they are regular ones, written so that they appear whole or not at all."""
+"""Reading regular files only, and writing files atomically."""
 
 import logging
 import os
@@ -20,7 +20,7 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-# What small files may take in memory, however well they are compressed.
+# Decompressed size that is allowed whatever the size of the file.
 ALWAYS_ALLOWED = 1 << 26  # bytes
 SCRATCH_PREFIX = ".idesplat-tmp-"
 SCRATCH_NAME = re.compile(re.escape(SCRATCH_PREFIX) + r"\w{8}")  # as tempfile.mkdtemp completes it
@@ -37,13 +37,13 @@ _collected: set[Path] = set()
 
 
 class WriteGuard(Protocol):
-    """What a running command asks before a file is written, and notes afterwards (see `outputs`)."""
+    """Asked before a file is written, and told afterwards (see `cli.outputs`)."""
 
     def check(self, path: Path) -> None:
-        """Raise InputError where the file must not be written; create its folder where that is missing."""
+        """Raise InputError if the file must not be written; create its folder if it is missing."""
 
     def written(self, path: Path) -> None:
-        """Take note of a file that has just been written."""
+        """Record a file that has been written."""
 
 
 LOG = logging.getLogger(__name__)
@@ -53,9 +53,9 @@ GUARD: ContextVar[WriteGuard | None] = ContextVar("GUARD", default=None)
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """Yield a temporary path of the same name that replaces `path` once the block ends without an exception.
+    """Yield a temporary path of the same name, which replaces `path` when the block ends without an exception.
 
-    A killed run leaves the old file or the new one, never half of one.
+    A killed process leaves the old file or the new one, never a partial one.
     Raises InputError if the folder cannot be written, or the running command must not replace the file.
     """
     path, guard = Path(path), GUARD.get()
@@ -108,11 +108,11 @@ def remove_abandoned_folders(parent: Path) -> None:
 def open_regular(path: Path) -> BinaryIO:
     """Open a regular file for reading in binary.
 
-    A named pipe would block for ever, and a device may have no end: InputError is raised for what is no regular file.
+    Raises InputError for other kinds of files: a named pipe would block, and a device may be infinite.
     Raises OSError as `open` does.
     """
     check_regular(path)
-    # Between the check and the opening another file may take the name: not blocking, and checked once more.
+    # The file can be replaced between the check and the opening: so it is opened without blocking, and checked again.
     descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     try:
         _check_kind(path, os.fstat(descriptor))
@@ -123,21 +123,21 @@ def open_regular(path: Path) -> BinaryIO:
 
 
 def check_regular(path: Path) -> None:
-    """Raise InputError for what exists and is no regular file, before a library opens it by its name.
+    """Raise InputError if the path is not a regular file, before a library opens it by its name.
 
     Raises OSError if there is no such file.
     """
     try:
         status = os.stat(path)
     except ValueError:  # NUL and lone surrogates
-        raise_input_error(path, "is no name that a file can have", "give the path of a file")
+        raise_input_error(path, "is not a valid file name", "give the path of a file")
     _check_kind(path, status)
 
 
 def read_bytes(path: Path, expected: str, largest: int | None = None) -> bytes:
-    """The content of a regular file; raises InputError, naming what was expected, if it cannot be read, or is empty.
+    """The content of a regular file. Raises InputError, naming what was `expected`, if it is not readable or is empty.
 
-    largest: bytes from which on it cannot be what was expected, either.
+    largest: maximum size in bytes.
     """
     path = Path(path)
     try:
@@ -156,7 +156,7 @@ def read_bytes(path: Path, expected: str, largest: int | None = None) -> bytes:
 
 
 def check_expansion(path: Path, unpacked: int, packed: int) -> None:
-    """Refuse a file of `packed` bytes that claims to hold so many more, before they take memory."""
+    """Raise InputError if `packed` bytes declare too large an unpacked size, before it is allocated."""
     if unpacked > max(ALWAYS_ALLOWED, EXPANSION.value * packed):
         raise InputError(
             f"{path}: {packed} bytes that claim to hold {unpacked} are no scene; copy or download it again, or "
@@ -165,7 +165,7 @@ def check_expansion(path: Path, unpacked: int, packed: int) -> None:
 
 
 def make_folder(path: Path) -> Path:
-    """Create `path` and its parents; raises InputError where that is not possible."""
+    """Create `path` and its parents. Raises InputError if that fails."""
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -174,7 +174,7 @@ def make_folder(path: Path) -> Path:
 
 
 def check_writable(folder: Path) -> None:
-    """Raise InputError unless files can be written into an existing folder; to be asked before long work."""
+    """Raise InputError unless the folder exists and is writable; a check before long work."""
     try:
         with tempfile.TemporaryFile(dir=folder):
             pass

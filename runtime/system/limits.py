@@ -1,6 +1,6 @@
-"""Limits that keep one damaged or hostile file from filling the memory, each with the variable that raises it.
+"""Limits against damaged or malicious files that would exhaust memory, each with an environment variable.
 
-All limits of this kind stand here. A message that names a limit ends in `Limit.remedy`.
+A message about a limit ends in `Limit.remedy`.
 """
 
 import os
@@ -14,9 +14,9 @@ MOST_DIGITS = 18
 
 @dataclass(frozen=True)
 class Limit:
-    """A number that an environment variable replaces.
+    """A limit with an environment variable that overrides it.
 
-    variable: its name. default: the number without it. unit: what it counts, for messages.
+    variable: its name. default: the value without it. unit: for messages.
     """
 
     variable: str
@@ -25,7 +25,7 @@ class Limit:
 
     @property
     def value(self) -> int:
-        """The number in force; raises InputError where the variable holds no positive whole number."""
+        """The current limit. Raises InputError if the variable is not a positive whole number."""
         text = os.environ.get(self.variable, "")
         if not text:
             return self.default
@@ -36,15 +36,15 @@ class Limit:
 
     @property
     def remedy(self) -> str:
-        """How to raise it, for the end of a message."""
+        """How to raise the limit, for messages."""
         return f"set the environment variable {self.variable} to more than {self.value}"
 
 
-# Of one image or video frame. The largest photographs of telephones have 200; a decoded one takes 3 bytes a pixel.
+# Of an image or video frame. Phones take images of up to 200 megapixels; decoded, a pixel takes 3 bytes.
 IMAGE_MEGAPIXELS = Limit("IDESPLAT_MAX_MEGAPIXELS", 256, "megapixels")
-# Gaussians take 44 to 236 bytes in memory and formats store 8 of them or more, so scenes expand by 30 at most.
+# A Gaussian takes 44 to 236 bytes in memory and at least 8 in a file, so scenes expand by at most a factor of 30.
 EXPANSION = Limit("IDESPLAT_MAX_EXPANSION", 64, "bytes in memory for one in the file")
-# A side of what is computed or rendered, for --size.
+# Of a side in --size.
 SIDE_PIXELS = Limit("IDESPLAT_MAX_SIDE", 8192, "pixels")
 
 

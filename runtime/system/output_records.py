@@ -1,10 +1,8 @@
-"""Which files were written by a command of ours, so that a later one may replace these and no others.
+"""Records of the files that commands have written, so that later commands replace these files and no others.
 
-A record in the user's cache folder names the files of one output folder, each with its size and the time of its last
-change. It holds for every format alike. A mark inside the file would not: .splat and .xyz have no room for one, an
-edited file would keep it, and a rendered image saved again by an editor would lose or keep it as the editor likes.
-Whatever was changed, copied or moved since, and whatever is not in the record because that was deleted, counts as
-somebody else's: the error is always on the side of keeping a file.
+There is one record for each output folder, in the cache folder. It lists file names with size and modification time.
+A mark inside the files is not possible: .splat and .xyz have no room for it, and an edited file would keep it. A file
+that was changed, copied or moved since it was written, or that is not in the record, is never replaced.
 """
 
 import hashlib
@@ -37,10 +35,10 @@ def read_record(folder: Path) -> dict[str, WrittenFile]:
     lines: list[str] = []
     with suppress(OSError, RuntimeError):
         record = _record_path(folder)
-        if record.is_file():  # a pipe would keep us waiting
+        if record.is_file():  # a pipe would block
             lines = record.read_text("ascii", errors="replace").splitlines()
     for line in lines:
-        # A line that was cut short, or damaged, is none.
+        # Truncated and damaged lines are ignored.
         with suppress(ValueError, TypeError, OverflowError, RecursionError):
             name, command, size, changed_ns = json.loads(line)
             if isinstance(name, str):
@@ -51,7 +49,7 @@ def read_record(folder: Path) -> dict[str, WrittenFile]:
 
 
 def add_to_record(path: Path, command: str) -> None:
-    """Note that `command` has just written a file; where the cache folder cannot be written, nothing is noted."""
+    """Record that `command` has written a file; without effect if the cache folder is not writable."""
     with suppress(OSError, RuntimeError):
         status = path.lstat()
         record = _record_path(path.parent)
@@ -66,7 +64,7 @@ def add_to_record(path: Path, command: str) -> None:
 
 
 def is_unchanged(path: Path, entry: WrittenFile | None) -> bool:
-    """Whether a file is still what the record says of it."""
+    """Whether a file still has the size and modification time of its entry."""
     if entry is None:
         return False
     try:

@@ -99,7 +99,7 @@ def test_images_that_are_not_read_are_named(tmp_path):
     assert [path.name for path in find_images([tmp_path])] == ["1.jpg", "2.heic"]
     assert [path.name for path in unsupported_images([tmp_path])] == ["a.gif", "IMG_1.cr2", "IMG_2.DNG", "z.nef"]
     assert describe_unsupported([str(tmp_path / "I*")]) == [
-        "2 images are of a format that is not read, and left out: IMG_1.cr2, IMG_2.DNG; save as JPEG or PNG"
+        "2 images are of an unsupported format, and left out: IMG_1.cr2, IMG_2.DNG; save as JPEG or PNG"
     ]
     assert describe_unsupported([tmp_path / "1.jpg"]) == []
 

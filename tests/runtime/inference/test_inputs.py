@@ -167,7 +167,7 @@ def test_unread_formats_are_said(capture):
     for name in ("IMG_1.dng", "IMG_2.gif"):
         (capture / "images" / name).write_bytes(b"")
     notes = read(capture, views=2).notes
-    assert "2 images are of a format that is not read, and left out: IMG_1.dng, IMG_2.gif; save as JPEG or PNG" in notes
+    assert "2 images are of an unsupported format, and left out: IMG_1.dng, IMG_2.gif; save as JPEG or PNG" in notes
 
 
 # ---- images that cameras name
