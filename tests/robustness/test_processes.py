@@ -171,7 +171,10 @@ def test_compiled_code_is_kept_in_our_cache(tmp_path):
     assert Path(done.stdout).is_relative_to(tmp_path / "idesplat" / "numba"), done.stderr
 
 
-@pytest.mark.parametrize("module", ["runtime.session", "runtime.openvino", "export.optimize", "tools.bench_products"])
+@pytest.mark.parametrize(
+    "module",
+    ["runtime.inference.session", "runtime.inference.openvino", "export.graph.cleanup", "tools.benchmark.components"],
+)
 def test_telemetry_is_off_before_onnx_runtime_is_imported(module):
     code = (
         "import importlib, os, sys\n"
