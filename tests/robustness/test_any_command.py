@@ -310,7 +310,7 @@ def test_the_good_calls_get_far(name: str, place: Path, capsys: pytest.CaptureFi
     err = capsys.readouterr().err.replace(LPIPS_IS_MISSING, "")
     late = {
         "export": "does not fit the network",
-        "cameras estimate": "points found in both",
+        "cameras estimate": "features match",
         "eval captures": "no network",
         "train": "expected at least",
     }
