@@ -40,6 +40,7 @@ from idesplat.tools.evaluation.captures.capture import parse_view_counts, read_c
 from idesplat.tools.evaluation.chunks import chunk_cases, read_chunk, read_index
 from idesplat.tools.evaluation.image_folders import load_case
 from idesplat.tools.training.log import TrainingLog
+from idesplat.tools.training.plots import write_curves
 from idesplat.tools.training.state import TrainingState
 from mutations import TEXTS, mutated, mutated_json, tried
 from PIL import Image
@@ -233,7 +234,7 @@ def read_capture_file(path: Path) -> None:
 
 def read_log(path: Path) -> None:
     log = TrainingLog(path, 2)
-    log.plot_curves(path.with_name("curves.png"), ["loss"])
+    write_curves(path.with_name("curves.png"), log.entries, ["loss"])
 
 
 def assert_one_line(error: Exception, path: Path) -> None:
