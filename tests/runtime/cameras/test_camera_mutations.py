@@ -133,7 +133,7 @@ def test_mutated_numbers_of_llff(tmp_path, pictures, data):
 @given(data=st.data())
 @pytest.mark.parametrize("kind", ["binary", "text"])
 def test_mutated_colmap(tmp_path, monkeypatch, kind, data):
-    monkeypatch.setattr(cameras_colmap, "SECONDS", 6)
+    monkeypatch.setattr(cameras_colmap, "CPU_SECONDS", 6)
     model = colmap_model(small())
     model.write_binary(tmp_path) if kind == "binary" else model.write_text(tmp_path)
     path = data.draw(st.sampled_from(sorted(path for path in tmp_path.iterdir() if path.is_file())))
