@@ -9,7 +9,6 @@ import os
 import shutil
 import signal
 import sys
-from functools import partial
 from pathlib import Path
 
 # Compiled code is kept between test runs, but not in the user's cache.
@@ -56,8 +55,13 @@ def small_network() -> IDESplat:
     return IDESplat(SMALL).eval()
 
 
-# For `preexec_fn`: a shell starts background commands with SIGINT ignored, and children inherit that.
-DEFAULT_SIGINT = None if os.name == "nt" else partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+def _default_signals() -> None:
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+
+
+# For `preexec_fn`: children inherit that a shell ignores SIGINT of background commands, and nohup SIGHUP.
+DEFAULT_SIGNALS = None if os.name == "nt" else _default_signals
 
 
 def run_command(main, *arguments) -> int:

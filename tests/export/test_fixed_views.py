@@ -42,11 +42,11 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (("--views", "4"), "--views 4: model.onnx was exported for 3 views; use --views 3"),
         (("--views", "2"), "--views 2: model.onnx was exported for 3 views; use --views 3"),
         (
-            ("--frames", "0,1,2,3"),
-            "--frames names 4 images: model.onnx was exported for 3 views; name 3, or add --views",
+            ("--select", "0,1,2,3"),
+            "--select names 4 images: model.onnx was exported for 3 views; name 3, or add --views",
         ),
-        (("--frames", "0,1"), "--frames names 2 images: model.onnx was exported for 3 views; name 3"),
-        (("--frames", "0,1", "--views", "3"), "--frames names 2 images: model.onnx was exported for 3 views; name 3"),
+        (("--select", "0,1"), "--select names 2 images: model.onnx was exported for 3 views; name 3"),
+        (("--select", "0,1", "--views", "3"), "--select names 2 images: model.onnx was exported for 3 views; name 3"),
     ),
 )
 def test_another_number_is_refused(
@@ -63,7 +63,7 @@ def test_too_few_images_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    "arguments", ((), ("--views", "3"), ("--frames", "0,2,4"), ("--frames", "0,1,2,4", "--views", "3"))
+    "arguments", ((), ("--views", "3"), ("--select", "0,2,4"), ("--select", "0,1,2,4", "--views", "3"))
 )
 def test_its_own_number_is_used(arguments: tuple[str, ...]) -> None:
     assert run_command(main, "--images", "images", *INFER, *arguments, "--json", "summary.json") == 0

@@ -26,7 +26,6 @@ from idesplat.runtime.inference.metadata import StageFile, write_manifest
 from idesplat.runtime.system.files import SCRATCH_PREFIX
 from idesplat.tools.benchmark import cli as bench
 from idesplat.tools.evaluation import cli as evaluate
-from idesplat.tools.evaluation.captures import checkouts
 from idesplat.tools.training import cli as train
 from idesplat.tools.training import trainer
 from mutations import TEXTS, make_odd_paths, mutated, mutated_json, tried
@@ -185,7 +184,7 @@ def place(good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, presets: 
     temporary.mkdir()
     monkeypatch.chdir(work)
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))
-    monkeypatch.setattr(checkouts, "fetch_checkout", no_network)
+    monkeypatch.setattr("idesplat.tools.evaluation.evaluate.fetch_checkout", no_network)
     monkeypatch.setattr(trainer.Trainer, "fit", lambda self, *arguments: None)  # training itself has tests of its own
     monkeypatch.setenv("IDESPLAT_RUN_LIMIT", "20")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path.parent / f"{tmp_path.name}-cache"))

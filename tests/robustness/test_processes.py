@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from conftest import DEFAULT_SIGINT
+from conftest import DEFAULT_SIGNALS
 from idesplat.runtime.inference.bundled_model import bundled_model
 from idesplat.runtime.splats.formats.ply import write_ply
 from idesplat.runtime.splats.gaussians import with_colours
@@ -274,7 +274,7 @@ def test_signals_clean_up(tmp_path, name, status):
     out = tmp_path / "out.txt"
     command = [sys.executable, "-P", "-c", WAITING, out]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    waiting = subprocess.Popen(command, **pipes, preexec_fn=DEFAULT_SIGINT)
+    waiting = subprocess.Popen(command, **pipes, preexec_fn=DEFAULT_SIGNALS)
     assert waiting.stdout.readline() == "waiting\n"
     waiting.send_signal(number)
     printed = waiting.communicate(timeout=60)

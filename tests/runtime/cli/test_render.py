@@ -499,7 +499,7 @@ def test_paths_of_one_view_or_frame() -> None:
     np.testing.assert_array_equal(interpolate_extrinsics(VIEWS[2:3], 4), np.repeat(VIEWS[2:3], 4, axis=0))
     np.testing.assert_allclose(interpolate_extrinsics(VIEWS, 1), VIEWS[:1], atol=1e-12)
     for views, frames in ((VIEWS, 0), (VIEWS[:0], 5)):
-        with pytest.raises(InputError, match="expected one of each"):
+        with pytest.raises(InputError, match="expected at least one of each"):
             interpolate_extrinsics(views, frames)
 
 

@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from conftest import DEFAULT_SIGINT, run_command
+from conftest import DEFAULT_SIGNALS, run_command
 from idesplat.runtime.cli.view import main
 from idesplat.runtime.splats.formats.ply import write_ply
 from idesplat.runtime.splats.gaussians import with_colours
@@ -54,7 +54,7 @@ def served(scene):
         command = [sys.executable, "-P", "-c", "from idesplat.runtime.cli.view import main; main()", str(scene)]
         command += ["--no-browser", *map(str, arguments)]
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-        processes.append(subprocess.Popen(command, **pipes, preexec_fn=DEFAULT_SIGINT))
+        processes.append(subprocess.Popen(command, **pipes, preexec_fn=DEFAULT_SIGNALS))
         line = processes[-1].stdout.readline()
         return next(word for word in line.split() if word.startswith("http://")), processes[-1]
 

@@ -118,7 +118,7 @@ def test_scene_gives_the_metrics_of_the_library(workplace: Path, opened: Predict
 def test_the_library_gives_the_same_prints_nothing_and_reports_progress(
     workplace: Path, opened: Predictor, capfd: Capture
 ) -> None:
-    assert run_command(main, *SCENE, *NAMED, "--depth", "depth") == 0
+    assert run_command(main, *SCENE, *NAMED, "--true-depth", "depth") == 0
     capfd.readouterr()
     reports: list[Progress] = []
     with reporting_to(reports.append):
@@ -243,7 +243,7 @@ BAD = {
     "more views than images": (nothing, (*SCENE, "--views", "5"), "too few are left"),
     "no images": (nothing, ("scene", "nowhere", *SCENE[2:]), "nowhere"),
     "no cameras": (nothing, (*SCENE, "--cameras", "none.json"), "none.json"),
-    "cameras at one place": (cameras_at_one_place, (*SCENE, *NAMED), "same place"),
+    "cameras at one place": (cameras_at_one_place, (*SCENE, *NAMED), "same position"),
     "no model": (nothing, (*SCENE, "--model", "none.onnx"), "none.onnx"),
     "a size it cannot take": (nothing, (*SCENE, "--size", "64x50"), "multiples of 16"),
     "near behind far": (nothing, (*SCENE, "--near", "5", "--far", "2"), "expected 0 < near < far"),
