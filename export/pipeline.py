@@ -7,11 +7,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..runtime.cli.outputs import Outputs
 from ..runtime.errors import InputError
 from ..runtime.images.sizes import describe_size_rule, is_valid_size
 from ..runtime.inference.metadata import ModelMetadata
 from ..runtime.system.files import check_writable
+from ..runtime.system.outputs import Outputs
 from ..runtime.system.progress import ProgressCallback, reporting_to
 
 if TYPE_CHECKING:

@@ -45,7 +45,7 @@ def invert_intrinsics(intrinsics: Tensor) -> Tensor:
     return torch.stack(rows, dim=-1).reshape(-1, 3, 3)
 
 
-def denormalize_intrinsics(intrinsics: Tensor, height: int, width: int) -> Tensor:
+def denormalize_intrinsics(intrinsics: Tensor, width: int, height: int) -> Tensor:
     """Normalised intrinsics [views, 3, 3] -> in pixels of a map of this size."""
     return torch.cat([intrinsics[:, :1] * width, intrinsics[:, 1:2] * height, intrinsics[:, 2:]], dim=1)
 

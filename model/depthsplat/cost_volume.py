@@ -33,7 +33,7 @@ def cost_volume(
     """
     views, _, height, width = features.shape
     channels, count = static_dim(features.shape[1]), static_dim(candidates.shape[1])
-    intrinsics = denormalize_intrinsics(cameras.intrinsics, height, width)
+    intrinsics = denormalize_intrinsics(cameras.intrinsics, width, height)
     x, y = sampling_points(candidates, intrinsics, cameras.extrinsics, neighbours)
     if torch.onnx.is_in_onnx_export():
         scores = by_gathering(features, neighbours, x, y, gather_attention)

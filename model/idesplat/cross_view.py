@@ -52,7 +52,7 @@ def _project(inverse_depth: Tensor, cameras: Cameras, neighbours: Tensor) -> tup
     Positions outside the image or behind the camera are clamped to the border of zeros.
     """
     height, width = inverse_depth.shape[2:]
-    pixels = denormalize_intrinsics(cameras.intrinsics, height, width)
+    pixels = denormalize_intrinsics(cameras.intrinsics, width, height)
     x, y, projected, front = project_points(inverse_depth, pixels, cameras.extrinsics, neighbours)
     return torch.where(front, x, -1.0).clamp(-1, width), torch.where(front, y, -1.0).clamp(-1, height), projected
 

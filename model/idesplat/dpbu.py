@@ -59,7 +59,7 @@ class DPBU(nn.Module):
         candidates: inverse depths, [views, candidates, h, w]. neighbours: [views, n].
         """
         height, width = features.shape[2:]
-        pixels = denormalize_intrinsics(cameras.intrinsics, height, width)
+        pixels = denormalize_intrinsics(cameras.intrinsics, width, height)
         rows = warp_indices(candidates, pixels, cameras.extrinsics, neighbours)
         features, prior = self.first(features, coarse_inverse_depth, rows, None)
         first_depth, _ = expectation(prior, candidates)

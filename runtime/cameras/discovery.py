@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ..errors import InputError
-from ..images.io import SUFFIXES
-from ..images.video_reader import is_video
+from ..images.finding import SUFFIXES, is_video
+from ..system.output_names import CAMERAS_FILE
 from .image_files import IMAGE_FOLDERS
 from .io import detect_format
 
-OWN_FILE = "cameras.json"  # what `idesplat cameras estimate` is told to write in its examples
 BESIDE_VIDEO = (".json", ".txt")  # endings of cameras that are called like a video
 
 
@@ -48,7 +47,7 @@ def _beside(image: Path) -> Path | None:
     folder = image if image.is_dir() else image.parent
     above = folder / ".." if folder == Path() or folder.name == ".." else folder.parent
     for place in (folder, above):
-        for candidate in (place, place / OWN_FILE):
+        for candidate in (place, place / CAMERAS_FILE):
             if _is_known(candidate):
                 return candidate
     return None

@@ -4,8 +4,8 @@ import os
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
+from ..images.finding import SUFFIXES, find_images, image_stem
 from ..images.header import image_size
-from ..images.io import SUFFIXES, find_images, image_stem
 
 GIVE_IMAGES = "give the images with --images, which idesplat cameras convert takes, too"
 # Datasets keep images in the folder of the camera file, or in these subfolders of it or of a parent: COLMAP models lie

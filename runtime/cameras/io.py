@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 from ..errors import InputError, error_context
 from .camera import Camera
 from .formats import CameraFormat as CameraFormat
-from .formats import format_module, format_modules
+from .formats import format_module, format_modules, own, transforms
 from .source import CameraSource
 
 
@@ -45,8 +45,6 @@ def write_cameras(path: Path, cameras: Sequence[Camera]) -> None:
     `read_cameras` reads the own format back exactly. Raises InputError if the folder is not writable, or if the format
     cannot represent a camera.
     """
-    from .formats import own, transforms
-
     path = Path(path)
     writer = transforms if path.name == transforms.FILE_NAME else own
     writer.write(path, cameras)

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..errors import InputError
+from ..system.output_names import CAMERAS_FILE
+from ..system.outputs import outputs
 from .options import IMAGES_HELP, CamerasFormat, Config, Focal, Images, MoreImages, Overwrite, Quiet, Verbose
-from .outputs import command, outputs
+from .outputs import command
 from .reporting import note
 from .terminal import HELP_OPTIONS, run, say
 
@@ -30,7 +32,7 @@ app = typer.Typer(
 @command("idesplat cameras estimate")
 def estimate(
     photos: Annotated[list[Path] | None, typer.Argument(metavar="PHOTOS", help=IMAGES_HELP, show_default=False)] = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help=OUT_HELP)] = Path("cameras.json"),
+    out: Annotated[Path, typer.Option("--out", "-o", help=OUT_HELP)] = Path(CAMERAS_FILE),
     images: Images = None,
     focal: Focal = None,
     overwrite: Overwrite = False,
@@ -41,7 +43,7 @@ def estimate(
     """Estimate the cameras of images of one scene that does not move, as `idesplat infer` does where it finds none."""
     from ..cameras.camera import named_from
     from ..cameras.io import write_cameras
-    from ..images.io import describe_unsupported
+    from ..images.finding import describe_unsupported
     from ..sfm.estimate import describe_estimate, estimate_cameras
     from ..system.files import scratch_folder
     from ..views.sources import find_input_images
@@ -81,7 +83,7 @@ def convert(
     --images are needed where the format does not name the images, or does not tell their size.
     """
     from ..cameras.io import detect_format, read_cameras, write_cameras
-    from ..images.io import find_images
+    from ..images.finding import find_images
     from .input_files import camera_files, given_images
 
     _check_name(out)

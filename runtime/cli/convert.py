@@ -6,8 +6,9 @@ from typing import Annotated
 import typer
 
 from ..errors import InputError
+from ..system.outputs import outputs
 from .options import Config, Overwrite, Quiet, Verbose
-from .outputs import command, outputs
+from .outputs import command
 from .reporting import note
 from .terminal import run, say
 

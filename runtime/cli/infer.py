@@ -10,6 +10,7 @@ import typer
 from ..cameras.formats import ESTIMATE
 from ..errors import InputError
 from ..inference.depth_format import DepthFormat
+from ..system.output_names import SPLATS
 from .options import (
     CamerasFormat,
     Config,
@@ -203,13 +204,13 @@ def _named_after(images: list[Path]) -> Path:
     """The file of splats in the current folder that is named after the folder of the images, or the video."""
     if not images:
         raise InputError("--out: expected the file to write, such as scene.ply, where --cameras name the images")
-    from ..images.video_reader import is_video
+    from ..images.finding import is_video
 
     first = images[0]
     if not first.is_dir() and is_video(first):
-        return Path(f"{first.stem}.ply")
+        return Path(first.stem + SPLATS)
     folder = first if first.is_dir() else first.parent
-    return Path(f"{folder.resolve().name or 'scene'}.ply")
+    return Path((folder.resolve().name or "scene") + SPLATS)
 
 
 def _tell(result: "Reconstruction", targets: "Targets", seconds: dict[str, float], camera_format: str | None) -> None:

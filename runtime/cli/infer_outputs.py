@@ -14,18 +14,18 @@ from ..inference.model_files import ModelFiles
 from ..reconstruction.files import PATH_FRAMES, depth_files, render_files
 from ..reconstruction.result import Reconstruction
 from ..splats.filtering import FilterOptions
-from ..splats.io import MESH_ENDINGS, holds_splats, is_mesh, splat_suffix
+from ..splats.io import holds_splats, is_mesh, splat_suffix
 from ..splats.mesh import MAX_DEPTH_JUMP
 from ..splats.points import POINT_SUFFIXES
+from ..system.output_names import DEPTH_FOLDER, ESTIMATED_CAMERAS, MESH_ENDINGS, beside
+from ..system.outputs import outputs
 from .input_files import camera_files, given_images, model_files, named_images
-from .outputs import STANDARD_OUTPUT, outputs, write_json
+from .outputs import STANDARD_OUTPUT, write_json
 from .reporting import note
 from .terminal import say
 
 # How many pixels COLMAP's fusion asks of a point unless told otherwise.
 COLMAP_MIN_PIXELS = 5
-DEPTH_FOLDER = "-depth"  # ends the name of the folder where a model that predicts depth alone is not told where to
-ESTIMATED_CAMERAS = ".cameras.json"  # ends the name of the cameras that were estimated, beside the scene
 
 
 @dataclass
@@ -157,5 +157,4 @@ class Targets:
         return self.depth_format or DepthFormat.NPZ
 
     def _beside(self, ending: str) -> Path:
-        """A path beside the scene, called like it but for the ending."""
-        return self.out.with_name(self.out.name[: -len(splat_suffix(self.out))] + ending)
+        return beside(self.out, splat_suffix(self.out), ending)

@@ -30,7 +30,7 @@ def camera_files(cameras: Path) -> list[Path]:
 
 def given_images(given: Sequence[str | Path]) -> list[Path]:
     """The images, or videos, that folders, globs and files stand for; nothing is said of what there is not."""
-    from ..images.io import SUFFIXES
+    from ..images.finding import SUFFIXES
 
     found: list[Path] = []
     for item in given:
@@ -59,7 +59,7 @@ def nearby_images(path: Path, cameras: Iterable["Camera"]) -> list[Path]:
     path: the file or folder that the cameras were read from, such as `sparse/0` beside a folder `images`.
     """
     from ..cameras.image_files import IMAGE_FOLDERS, image_roots
-    from ..images.io import SUFFIXES, image_stem
+    from ..images.finding import SUFFIXES, image_stem
 
     stems_in = defaultdict(set)  # folder of a name -> its stems
     for camera in cameras:

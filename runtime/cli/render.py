@@ -12,6 +12,7 @@ from ..cameras.camera import Camera, offset_cameras
 from ..cameras.io import read_cameras
 from ..errors import InputError
 from ..images.colormaps import colormap_depth, inverse_depth_range
+from ..images.finding import SUFFIXES, VIDEO_SUFFIXES
 from ..images.naming import name_files
 from ..images.png import save_png
 from ..images.sizes import parse_size
@@ -23,7 +24,6 @@ from ..rendering.cameras import (
     SCENE_ORBIT_DEG,
     check_image_sizes,
     fit_camera,
-    frame_names,
     orbit_cameras,
     overview_camera,
     path_cameras,
@@ -33,15 +33,16 @@ from ..rendering.types import Rendering
 from ..splats.gaussians import Gaussians
 from ..splats.io import read_offset, read_splats
 from ..system.files import atomic_write
+from ..system.output_names import ALPHA, ARRAYS, DEPTH, IMAGE, VIDEO, frame_names, kind_file
+from ..system.outputs import outputs
 from ..system.progress import progress
 from .input_files import camera_files, named_images, nearby_images
 from .options import Cameras, CamerasFormat, Config, Overwrite, Quiet, Verbose, parse_count
-from .outputs import command, outputs
+from .outputs import command
 from .terminal import run, say
 
 COMMAND = "idesplat render"
-VIDEO, IMAGE = ".mp4", ".png"
-COLOUR, DEPTH, ALPHA = "", "-depth", "-alpha"  # what an image shows, as its name ends
+COLOUR = ""  # beside DEPTH and ALPHA: what an image shows, as its name ends
 SOLID = 0.5  # alpha from which on a pixel has a depth
 SIZE = "360x640"  # where neither cameras nor --size say so
 MOST_LISTED = 12  # files that are named one by one
@@ -123,10 +124,7 @@ def main() -> None:
 
 def _check_out(out: Path) -> None:
     """Refuse what is not made: a kind of image or video by its name, or any video where its library is missing."""
-    from ..images.io import SUFFIXES as IMAGES
-    from ..images.video_reader import SUFFIXES as VIDEOS
-
-    if out.suffix.lower() in {*IMAGES, *VIDEOS, ".gif"} - {IMAGE, VIDEO} and not out.is_dir():
+    if out.suffix.lower() in {*SUFFIXES, *VIDEO_SUFFIXES, ".gif"} - {IMAGE, VIDEO} and not out.is_dir():
         raise InputError(f"--out {out}: expected a folder, or a file that ends in {IMAGE} or {VIDEO}")
     if out.suffix.lower() == VIDEO:
         check_video_support()
@@ -166,16 +164,16 @@ def _announce(
 
 
 def _video_path(out: Path, kind: str) -> Path:
-    return out.with_stem(out.stem + kind)
+    return kind_file(out.with_suffix(""), kind, out.suffix)
 
 
 def _image_path(stem: Path, kind: str) -> Path:
-    return stem.with_name(stem.name + kind + IMAGE)
+    return kind_file(stem, kind, IMAGE)
 
 
 def _metric_path(stem: Path) -> Path:
     """Of the depth in world units."""
-    return stem.with_name(stem.name + DEPTH + ".npz")
+    return kind_file(stem, DEPTH, ARRAYS)
 
 
 def _choose_cameras(

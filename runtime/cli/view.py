@@ -3,6 +3,7 @@
 import contextlib
 import webbrowser
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,8 +11,9 @@ import typer
 
 from ..cameras.io import CameraFormat
 from ..errors import InputError, Terminated
+from ..system.outputs import outputs
 from .options import Cameras, CamerasFormat, Config, Images, MoreImages, Overwrite, Quiet, Verbose
-from .outputs import command, outputs
+from .outputs import command
 from .terminal import run, say
 
 if TYPE_CHECKING:
@@ -120,8 +122,6 @@ def read_viewpoints(cameras: Path | None, form: CameraFormat | None, images: lis
 
     Raises InputError for what cannot be read, or does not belong together.
     """
-    from dataclasses import replace
-
     from ..cameras.io import read_cameras
     from ..system.files import scratch_folder
     from ..system.progress import progress

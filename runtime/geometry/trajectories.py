@@ -1,8 +1,4 @@
-"""Camera trajectories: interpolation between views, and orbits.
-
-Own code instead of scipy's Slerp and CubicHermiteSpline: these round differently, and rendered frames are to stay
-bit-identical.
-"""
+"""Camera trajectories: interpolation between views, and orbits."""
 
 import numpy as np
 
@@ -16,7 +12,8 @@ def interpolate_extrinsics(extrinsics: np.ndarray, frames: int) -> np.ndarray:
     Catmull-Rom spline, which passes through every view; rotations are interpolated by slerp. One view gives a static
     camera. Raises InputError without a view or a frame.
     """
-    import cv2
+    from scipy.interpolate import CubicHermiteSpline
+    from scipy.spatial.transform import Rotation, Slerp
 
     if len(extrinsics) == 0 or frames < 1:
         raise InputError(
@@ -26,33 +23,21 @@ def interpolate_extrinsics(extrinsics: np.ndarray, frames: int) -> np.ndarray:
     if len(extrinsics) == 1:
         return np.repeat(extrinsics, frames, axis=0)
 
-    times = np.linspace(0, len(extrinsics) - 1, frames)
-    segments = np.minimum(times.astype(int), len(extrinsics) - 2)
+    views, times = np.arange(len(extrinsics)), np.linspace(0, len(extrinsics) - 1, frames)
+    rotations, positions = Rotation.from_matrix(extrinsics[:, :3, :3]), extrinsics[:, :3, 3]
     poses = np.tile(np.eye(4), (frames, 1, 1))
-    for pose, segment, t in zip(poses, segments, times - segments, strict=True):
-        start, end = extrinsics[segment, :3, :3], extrinsics[segment + 1, :3, :3]
-        rotation_vector, _ = cv2.Rodrigues(start.T @ end)
-        pose[:3, :3] = start @ cv2.Rodrigues(t * rotation_vector)[0]  # slerp
-        pose[:3, 3] = _catmull_rom(extrinsics[:, :3, 3], segment, t)
+    poses[:, :3, :3] = Slerp(views, rotations)(times).as_matrix()
+    poses[:, :3, 3] = CubicHermiteSpline(views, positions, _catmull_rom_tangents(positions))(times)
     return poses
 
 
-def _catmull_rom(points: np.ndarray, segment: int, t: float) -> np.ndarray:
-    """The spline through points [points, 3] at t in [0, 1] of a segment.
+def _catmull_rom_tangents(points: np.ndarray) -> np.ndarray:
+    """The tangents [points, 3] of the spline at its points [points, 3]: half the chord between the neighbouring points.
 
-    A cubic Hermite spline, whose tangents are half the chord between the neighbouring points; before the first and
-    after the last point it is extended linearly.
+    Before the first and after the last point the points are extended linearly.
     """
-    before = points[segment - 1] if segment > 0 else 2 * points[0] - points[1]
-    start, end = points[segment], points[segment + 1]
-    after = points[segment + 2] if segment + 2 < len(points) else 2 * points[-1] - points[-2]
-    start_tangent, end_tangent = (end - before) / 2, (after - start) / 2
-    return (
-        start
-        + t * start_tangent
-        + t**2 * (3 * (end - start) - 2 * start_tangent - end_tangent)
-        + t**3 * (2 * (start - end) + start_tangent + end_tangent)
-    )
+    extended = np.vstack([2 * points[0] - points[1], points, 2 * points[-1] - points[-2]])
+    return (extended[2:] - extended[:-2]) / 2
 
 
 def orbit_extrinsics(start: np.ndarray, pivot: np.ndarray, axis: np.ndarray, degrees: float, frames: int) -> np.ndarray:
@@ -61,15 +46,14 @@ def orbit_extrinsics(start: np.ndarray, pivot: np.ndarray, axis: np.ndarray, deg
     360 degrees are a full turn; for a smaller angle the camera swings by half of it to either side. Both are loops:
     the first frame can follow the last. Raises InputError without a frame or an angle in (0, 360].
     """
-    import cv2
+    from scipy.spatial.transform import Rotation
 
     if frames < 1 or not 0 < degrees <= 360:
         raise InputError(f"an orbit of {frames} frames over {degrees:g} degrees; expected one frame, 0 to 360 degrees")
     phase = np.arange(frames) / frames
     angles = np.radians(degrees * phase if degrees == 360 else degrees / 2 * np.sin(2 * np.pi * phase))
+    rotations = Rotation.from_rotvec(angles[:, None] * axis / np.linalg.norm(axis)).as_matrix()  # [frames, 3, 3]
     poses = np.tile(np.eye(4), (frames, 1, 1))
-    for pose, angle in zip(poses, angles, strict=True):
-        rotation = cv2.Rodrigues(angle * axis / np.linalg.norm(axis))[0]
-        pose[:3, :3] = rotation @ start[:3, :3]
-        pose[:3, 3] = pivot + rotation @ (start[:3, 3] - pivot)
+    poses[:, :3, :3] = rotations @ start[:3, :3]
+    poses[:, :3, 3] = pivot + rotations @ (start[:3, 3] - pivot)
     return poses

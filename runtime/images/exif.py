@@ -8,6 +8,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..system.files import open_regular
+from .header import open_image, read_exif
 
 # EXIF's FocalLengthIn35mmFilm is relative to the diagonal of 35 mm film (CIPA DCG-001).
 FILM_DIAGONAL_MM = float(np.hypot(36, 24))
@@ -31,8 +32,6 @@ def exif_focal(path: Path, width: int, height: int) -> float | None:
 
     Uses the 35 mm equivalent, which does not depend on the resolution.
     """
-    from .header import open_image, read_exif
-
     try:
         with open_regular(path) as file, open_image(path, file) as image:
             value = read_exif(image).get_ifd(EXIF_DIRECTORY).get(FOCAL_LENGTH_35MM)

@@ -1,10 +1,12 @@
 """Names of files that are made of images."""
 
 import itertools
-import unicodedata
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import PurePosixPath
+
+from ..system.files import without_case
+from .finding import image_stem
 
 UNNAMED = "image"  # for a file whose image has no name
 
@@ -16,8 +18,6 @@ def name_files(images: Sequence[str], endings: Sequence[str] = ("",)) -> list[st
     of the names differ in case alone, and none is another one with an ending, so that `a` with the ending `-depth` and
     `a-depth` are told apart.
     """
-    from .io import image_stem  # loads OpenCV, which a help text does not need
-
     paths = [PurePosixPath(image.replace("\\", "/")) for image in images]
     stems = [image_stem(path) or UNNAMED for path in paths]
     if _distinct(stems, endings):
@@ -37,8 +37,3 @@ def name_files(images: Sequence[str], endings: Sequence[str] = ("",)) -> list[st
 def _distinct(names: Sequence[str], endings: Sequence[str]) -> bool:
     counts = Counter(without_case(name + ending) for name in names for ending in endings)
     return all(count == 1 for count in counts.values())
-
-
-def without_case(text: str) -> str:
-    """The same for names that a file system may take for one: Windows and macOS ignore case, macOS how é is encoded."""
-    return unicodedata.normalize("NFC", text).casefold()

@@ -16,16 +16,10 @@ from ..system.limits import parse_whole_number
 from ..system.progress import working
 from .header import check_megapixels
 
-SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 FRAMES = 20
 CANDIDATES = 15  # frames considered for each one that is extracted
 SHARPNESS_SIDE = 480  # pixels, at which sharpness is measured
 NUMBERED = re.compile(r"(.+)-(\d{6,})")
-
-
-def is_video(path: Path) -> bool:
-    """Whether a file is a video by its suffix."""
-    return path.suffix.lower() in SUFFIXES
 
 
 def extract_sharp_frames(video: Path, folder: Path) -> list[Path]:

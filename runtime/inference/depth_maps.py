@@ -23,15 +23,9 @@ import numpy as np
 from ..images.png import save_depth_png
 from ..images.resizing import cover_crop
 from ..system.files import atomic_write
+from ..system.output_names import depth_map_files
 from ..views.batch import ViewBatch
 from .predictor import Prediction
-
-ENDINGS = (".png", ".npz")
-
-
-def depth_map_files(folder: Path, stems: Sequence[str]) -> list[Path]:
-    """The files that `write_depth_maps` writes."""
-    return [folder / (stem + ending) for stem in stems for ending in ENDINGS]
 
 
 def write_depth_maps(folder: Path, stems: Sequence[str], prediction: Prediction, views: ViewBatch) -> list[Path]:

@@ -13,7 +13,7 @@ from ..cameras.formats import ESTIMATE, CameraFormat
 from ..cameras.io import read_cameras
 from ..errors import InputError
 from ..images.arrays import as_uint8_image
-from ..images.io import describe_unsupported, image_stem
+from ..images.finding import describe_unsupported, image_stem
 from ..images.resizing import cover_crop
 from ..images.sizes import nearest_size
 from ..sfm.estimate import describe_estimate, estimate_cameras

@@ -12,6 +12,7 @@ from ..cameras.camera import Camera
 from ..errors import InputError
 from ..geometry.trajectories import interpolate_extrinsics, orbit_extrinsics
 from ..splats.gaussians import Gaussians
+from ..system.output_names import frame_names
 from .render import render_view
 
 OVERVIEW_FOV = math.radians(60)  # of the shorter side
@@ -91,11 +92,6 @@ def focus_depth(gaussians: Gaussians, camera: Camera) -> float:
     if not covered.any():
         raise InputError(f"the camera {camera.name} sees nothing of the scene; give the cameras that belong to it")
     return float(np.median(rendering.depth[covered] / rendering.alpha[covered]))
-
-
-def frame_names(frames: int) -> list[str]:
-    """Names of the cameras of a path or an orbit."""
-    return [f"frame-{index:04d}" for index in range(frames)]
 
 
 def check_image_sizes(cameras: Sequence[Camera]) -> None:

@@ -23,6 +23,7 @@ from ..images.header import DamagedImage
 from ..images.io import load_image
 from ..system.progress import progress, working
 from .features import Features, extract_features, match_features, normalize_points
+from .incremental import check_pycolmap, run_incremental_sfm
 from .two_view import TwoViewGeometry, estimate_relative_pose, rotation_only_inlier_ratio
 
 DECODED_BYTES = 1 << 29  # of decoded images that are kept, so that they need not be read again
@@ -62,8 +63,6 @@ def estimate_cameras(
     than two images without pycolmap, or if no image can be registered.
     """
     if len(images) > 2:
-        from .incremental import check_pycolmap
-
         check_pycolmap(len(images))
     skipped_lines: list[str] = []
     usable = _load_all(images, focal, skipped_lines, {} if decoded is None else decoded)
@@ -75,8 +74,6 @@ def estimate_cameras(
     if skipped is not None:
         skipped += skipped_lines
     if len(usable) > 2:
-        from .incremental import run_incremental_sfm
-
         return _normalized(*run_incremental_sfm(usable, refine_focal=focal is None))
     with working("estimating the cameras"):
         return _normalized(*_two_cameras(*usable))

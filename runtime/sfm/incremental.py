@@ -1,6 +1,7 @@
 """Incremental structure from motion for more than two images: own features and matches, COLMAP's mapper (pycolmap)."""
 
 import importlib.util
+import logging
 from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
     import pycolmap
 
     from .estimate import UncalibratedImage
+
+LOG = logging.getLogger(__name__)
 
 CAMERA_MODEL = "SIMPLE_RADIAL"
 INITIAL_FOCAL = 1.0  # in longer image sides, where the focal length is unknown
@@ -56,10 +59,22 @@ def run_incremental_sfm(images: "Sequence[UncalibratedImage]", refine_focal: boo
             f"--cameras estimate: none of the {len(images)} images could be registered; give more images that overlap, "
             "show texture, and are taken a step apart"
         )
+    LOG.info("COLMAP's mapper made %d models of %d images", len(models), len(images))
     best = max(models.values(), key=lambda model: model.num_reg_images())
     path_of = {_name(index): image.path for index, image in enumerate(images)}
     cameras = [to_camera({**found, "name": str(path_of[found["name"]])}) for found in describe(best)]
-    return cameras, np.concatenate([observed_depths(best, image) for image in best.images.values() if image.has_pose])
+    depths = [observed_depths(best, image) for image in best.images.values() if image.has_pose]
+    return cameras, _checked(np.concatenate(depths), len(cameras))
+
+
+def _checked(depths: np.ndarray, registered: int) -> np.ndarray:
+    """The depths [points], whose median becomes the unit; raises InputError if it cannot."""
+    if len(depths) == 0 or not 0 < np.median(depths) < np.inf:
+        raise InputError(
+            f"--cameras estimate: {registered} images were registered, but no points in front of them found, whose "
+            "depth would tell the scale; give more images that overlap, show texture, and are taken a step apart"
+        )
+    return depths
 
 
 def _name(index: int) -> str:

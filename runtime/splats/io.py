@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import InputError
+from ..system.output_names import MESH_ENDINGS, POINT_ENDINGS
 from .formats.compressed_ply import read_compressed_ply, write_compressed_ply
 from .formats.encoding import lost_offset as lost_offset
 from .formats.glb import glb_offset, read_glb, write_glb
@@ -48,10 +49,6 @@ FORMATS = {
     ".sog": SplatFormat(write_sog, read_sog, sog_offset),
     ".glb": SplatFormat(write_glb, read_glb, glb_offset),
 }
-
-# Endings of point clouds and meshes. The longest ending counts: .points.ply is not .ply.
-POINT_ENDINGS = (".points.ply", ".points.glb", ".obj", ".xyz")
-MESH_ENDINGS = (".mesh.ply", ".mesh.glb", ".mesh.obj")
 
 
 def write_splats(path: Path, gaussians: Gaussians, offset: np.ndarray | None = None) -> list[str]:

@@ -6,6 +6,7 @@ import re
 import shutil
 import stat
 import tempfile
+import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
@@ -37,7 +38,7 @@ _collected: set[Path] = set()
 
 
 class WriteGuard(Protocol):
-    """Asked before a file is written, and told afterwards (see `cli.outputs`)."""
+    """Asked before a file is written, and told afterwards (see `outputs`)."""
 
     def check(self, path: Path) -> None:
         """Raise InputError if the file must not be written; create its folder if it is missing."""
@@ -230,3 +231,8 @@ def _remove_if_abandoned(entry: os.DirEntry[str]) -> None:
             shutil.rmtree(entry.path, ignore_errors=True)
     finally:
         os.close(lock)
+
+
+def without_case(text: str) -> str:
+    """The same for names that a file system may take for one: Windows and macOS ignore case, macOS how é is encoded."""
+    return unicodedata.normalize("NFC", text).casefold()

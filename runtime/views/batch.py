@@ -13,8 +13,8 @@ from ..errors import InputError, error_context
 from ..geometry.baselines import nearest_neighbor_pairs, pairwise_baselines
 from ..geometry.intrinsics import check_intrinsics
 from ..geometry.rigid import check_rigid
+from ..images.finding import image_stem
 from ..images.header import DamagedImage
-from ..images.io import image_stem
 from .depth_range import scene_depths
 from .loader import FeatureImage, ImageCameraPair, ViewLoader
 from .selection import MIN_VIEWS, score_pairs, select_views

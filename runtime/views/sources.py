@@ -8,7 +8,7 @@ from ..cameras.image_files import IMAGE_FOLDERS, candidate_paths, image_roots
 from ..cameras.io import read_image_names
 from ..errors import InputError
 from ..images import video_reader
-from ..images.io import find_images
+from ..images.finding import find_images, is_video
 
 EXAMPLES = 3  # names in a message
 
@@ -25,7 +25,7 @@ def find_input_images(
     """
     if not given:
         return _images_of_cameras(cameras, camera_format)
-    videos = [path for path in given if video_reader.is_video(path)]
+    videos = [path for path in given if is_video(path)]
     if not videos:
         return find_images(given)
     if len(given) > 1:

@@ -10,14 +10,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.console import Console
 
 from ...runtime.cli.input_files import model_files
 from ...runtime.cli.options import Config, Json, Overwrite, Quiet, Verbose
-from ...runtime.cli.outputs import STANDARD_OUTPUT, command, outputs
+from ...runtime.cli.outputs import STANDARD_OUTPUT, command
 from ...runtime.cli.terminal import literal, run, say, warn
 from ...runtime.errors import InputError
 from ...runtime.images.sizes import parse_size
 from ...runtime.system.limits import parse_whole_number
+from ...runtime.system.outputs import outputs
 
 if TYPE_CHECKING:  # nothing heavy is loaded before there is something to measure
     from .report import Row
@@ -138,8 +140,6 @@ def _sizes(text: str | None) -> list[tuple[int, int]]:
 @contextmanager
 def _status() -> Iterator[Callable[[str], None]]:
     """Show what is being done, on stderr where that is a terminal."""
-    from rich.console import Console
-
     with Console(stderr=True).status("starting") as status:
         yield lambda doing: status.update(literal(doing))
 

@@ -8,7 +8,7 @@ import time
 from contextlib import ExitStack
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -18,12 +18,12 @@ from rich.table import Table
 from ...runtime.cli.terminal import run
 from ...runtime.geometry.intrinsics import intrinsic_matrix
 from ...runtime.inference.session import usable_cores
+from ...runtime.rendering.rasterizer import rasterize
+from ...runtime.splats.formats.ply import read_ply, write_ply
+from ...runtime.splats.gaussians import Gaussians
 from ...runtime.system.files import scratch_folder
 from .runner import SETTLE_SECONDS, thread_environment
 from .worker import Prepared, Worker
-
-if TYPE_CHECKING:
-    from ...runtime.splats.gaussians import Gaussians
 
 SIDE = 256
 FOCAL = 0.9 * SIDE
@@ -78,7 +78,6 @@ def rasterizer(compiled: bool) -> Prepared:
     """Our rasteriser, compiled or not; the first run includes compiling and loading."""
     if not compiled:
         sys.modules["numba"] = None  # type: ignore[assignment]  # hide it
-    from ...runtime.rendering.rasterizer import rasterize
 
     splats, K = pixel_sized_splats(RENDERED_SPLATS), pinhole()
 
@@ -90,8 +89,6 @@ def rasterizer(compiled: bool) -> Prepared:
 
 def pixel_sized_splats(count: int) -> "Gaussians":
     """Splats about a pixel wide in a camera at the origin, two at each pixel, as networks predict them."""
-    from ...runtime.splats.gaussians import Gaussians
-
     rng = np.random.default_rng(0)
     rows, columns = np.divmod(np.arange(count) % (SIDE * SIDE), SIDE)
     z = rng.uniform(1.5, 3, count)
@@ -135,8 +132,6 @@ def plain_file(folder: Path, verb: str) -> Prepared:
 
 def ply_file(folder: Path, verb: str) -> Prepared:
     """Our .ply files."""
-    from ...runtime.splats.formats.ply import read_ply, write_ply
-
     path, splats = folder / "ours.ply", pixel_sized_splats(FILE_SPLATS)
 
     def write() -> None:

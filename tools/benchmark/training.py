@@ -11,6 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rich.console import Console
+from rich.table import Table
+
 from ...runtime.errors import InputError
 from ...runtime.system.files import scratch_folder
 
@@ -66,9 +69,6 @@ def benchmark_training(rounds: int, steps: int, on_status: Callable[[str], None]
 
 def print_training(found: Measured) -> None:
     """Print the best round of every candidate in every phase."""
-    from rich.console import Console
-    from rich.table import Table
-
     table = Table("phase", "training", "scenes/s", "CPU s/scene", "where the time goes", title="best of the rounds")
     for (phase, candidate), measured in found.items():
         best = min(measured, key=lambda one: one["seconds"])

@@ -8,6 +8,7 @@ depth can give; the remaining error is pixels that no context view sees, and the
 
 from math import ceil
 
+import cv2
 import numpy as np
 
 from ...runtime.geometry.rigid import invert_rigid
@@ -118,8 +119,6 @@ def _warped(
 
     shape: height and width of the result.
     """
-    import cv2
-
     height, width = shape
     half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # OpenCV's pixel centres are at integers
     maps = np.linalg.inv(half) @ homography @ half

@@ -8,12 +8,14 @@ import typer
 
 from ...runtime.cli.input_files import camera_files, model_files
 from ...runtime.cli.options import CAMERAS_HELP, Config, Far, Model, Near, Overwrite, Quiet, Size, Verbose
-from ...runtime.cli.outputs import command, outputs
+from ...runtime.cli.outputs import command
 from ...runtime.cli.terminal import run, say, warn
 from ...runtime.errors import InputError
 from ...runtime.images.naming import name_files
 from ...runtime.images.sizes import parse_size
 from ...runtime.inference.bundled_model import bundled_model
+from ...runtime.system.output_names import IMAGE, RESULTS, strip_file
+from ...runtime.system.outputs import outputs
 from .defaults import CONTEXT_VIEWS, HELD_OUT_SCENES, HOLD_OUT_EVERY, VIEW_COUNTS
 
 if TYPE_CHECKING:  # nothing heavy is loaded before there is something to evaluate
@@ -58,7 +60,7 @@ def scene(
     if views is not None and context:
         raise InputError("--views and --context: expected one of them; --context names the views that there are")
     from ...runtime.cameras.io import read_cameras
-    from ...runtime.images.io import find_images
+    from ...runtime.images.finding import find_images
     from .evaluate import evaluate
     from .report import print_means, print_views
 
@@ -186,7 +188,7 @@ def captures(
         captures=capture or [],
         view_counts=counts,
         size=parse_size(size) if size else None,
-        on_target=lambda name, strip: save_png(out / f"{name}.png", strip),
+        on_target=lambda name, strip: save_png(out / f"{name}{IMAGE}", strip),
     )
     for warning in result.warnings:
         warn(f"warning: {warning}")
@@ -213,7 +215,7 @@ class StripWriter:
 
         if self.most is None or self.scenes < self.most:
             for name, strip in zip(name_files(list(strips)), strips.values(), strict=True):
-                save_png(self.folder / f"{result.name}-{name}.png", strip)
+                save_png(strip_file(self.folder, result.name, name), strip)
         self.scenes += 1
 
 
@@ -226,13 +228,11 @@ def _check_outputs(model: Path | None, out: Path, data: Sequence[Path]) -> None:
 
     Strips are named after scenes, which may not be known yet, so every .png in the folder counts as one to be replaced.
     """
-    from .report import RESULTS
-
     files = outputs()
     files.reads("the model", model_files(model or bundled_model()))
     files.reads("data", data)
     files.writes_into("--out", out)
-    files.writes("--out", [out / RESULTS, *out.glob("*.png")])
+    files.writes("--out", [out / RESULTS, *out.glob(f"*{IMAGE}")])
 
 
 def _write(out: Path, options: dict[str, object], result: "Evaluation") -> None:

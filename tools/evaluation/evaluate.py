@@ -16,7 +16,7 @@ import numpy as np
 from ...runtime.cameras.camera import Camera
 from ...runtime.cameras.io import read_cameras
 from ...runtime.errors import InputError
-from ...runtime.images.io import find_images
+from ...runtime.images.finding import find_images
 from ...runtime.inference.bundled_model import bundled_model
 from ...runtime.inference.metadata import ModelMetadata
 from ...runtime.inference.predictor import Predictor

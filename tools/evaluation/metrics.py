@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from importlib.util import find_spec
 
+import cv2
 import numpy as np
 
 from ...runtime.errors import InputError
@@ -47,7 +48,6 @@ def ssim(image: np.ndarray, truth: np.ndarray, valid: np.ndarray) -> float:
     image, truth: [height, width, 3], 0 to 1, not clipped. valid: bool [height, width]. Only pixels whose whole window
     is valid count; NaN if there is none.
     """
-    import cv2
     from skimage.metrics import structural_similarity
 
     _, similarity = structural_similarity(

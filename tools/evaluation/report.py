@@ -11,12 +11,12 @@ from rich.table import Table
 
 from ...runtime.cli.terminal import literal, say
 from ...runtime.system.files import atomic_write
+from ...runtime.system.output_names import RESULTS
 from .novel_views import MODEL, NEAREST, ORACLE_DEPTH, ORACLE_PLANE, Result, Scores
 
 if TYPE_CHECKING:
     from .evaluate import CaptureEvaluation, Evaluation
 
-RESULTS = "results.json"
 TITLES = {
     "psnr": "PSNR, dB",
     "psnr_covisible": "PSNR co-visible, dB",

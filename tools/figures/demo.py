@@ -10,8 +10,10 @@ import typer
 
 from ...runtime.cli.infer import infer
 from ...runtime.cli.options import Overwrite
-from ...runtime.cli.outputs import command, outputs
+from ...runtime.cli.outputs import command
 from ...runtime.cli.terminal import run
+from ...runtime.system.output_names import SPLATS, SUMMARY
+from ...runtime.system.outputs import outputs
 from ..synthetic.make_scene import make_scene
 
 
@@ -21,16 +23,16 @@ def demo(
 ) -> None:
     """Render images of a synthetic room, and reconstruct splats, depth maps and views from two of them."""
     scene = out / "scene"
-    outputs().writes("", [out / "scene.ply", out / "summary.json"])
+    outputs().writes("", [out / f"scene{SPLATS}", out / SUMMARY])
     make_scene(scene, seed=2, views=8, height=480, width=640, overwrite=overwrite)
     infer(
         images=[scene / "images"],
         cameras=str(scene / "transforms.json"),
-        out=out / "scene.ply",
+        out=out / f"scene{SPLATS}",
         save_depth=out / "depth",
         render=out / "views",
         timings=True,
-        json_path=out / "summary.json",
+        json_path=out / SUMMARY,
         overwrite=overwrite,
     )
 

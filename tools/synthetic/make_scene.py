@@ -15,12 +15,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
+from rich.console import Console
+from rich.progress import track
 
 from ...runtime.cli.options import Overwrite
-from ...runtime.cli.outputs import command, outputs
+from ...runtime.cli.outputs import command
 from ...runtime.cli.terminal import run, say
 from ...runtime.geometry.intrinsics import denormalize_intrinsics
 from ...runtime.system.files import atomic_write
+from ...runtime.system.outputs import outputs
 
 if TYPE_CHECKING:  # for a fast start: the ray caster is loaded when it is needed
     from .layout import Layout
@@ -128,8 +131,6 @@ def _with_progress(poses: np.ndarray) -> Iterable[np.ndarray]:
     """The poses, with a progress bar on stderr if that is a terminal."""
     if not sys.stderr.isatty():
         return poses
-    from rich.console import Console
-    from rich.progress import track
 
     return track(poses, "rendering", console=Console(stderr=True))
 

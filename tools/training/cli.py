@@ -9,9 +9,10 @@ from typing import Annotated, Any
 import typer
 
 from ...runtime.cli.options import Config, Overwrite, Quiet, Verbose
-from ...runtime.cli.outputs import command, outputs
+from ...runtime.cli.outputs import command
 from ...runtime.cli.terminal import run, say, warn
 from ...runtime.errors import InputError
+from ...runtime.system.outputs import outputs
 from .options import Objective, Part, PerceptualKind, Precision
 from .run_files import CHECKPOINT, CURVES, LOG, PREDICTIONS
 

@@ -63,7 +63,7 @@ def render_targets(gaussians: tuple[Tensor, ...], views: TrainingViews) -> Tenso
     """Gaussians (means, scales, quats, opacities, sh) seen by the target cameras, on black, [targets, 3, H, W]."""
     means, scales, quats, opacities, sh = gaussians
     height, width = views.target_images.shape[2:]
-    Ks = denormalize_intrinsics(views.target_intrinsics, height, width)
+    Ks = denormalize_intrinsics(views.target_intrinsics, width, height)
     background = torch.zeros(3)
     images = [
         rasterize(means, quats, scales, opacities, sh, viewmat, K, width, height, background)[0]

@@ -19,7 +19,10 @@ import numpy as np
 from ...errors import InputError, error_context
 from ...geometry.intrinsics import scale_intrinsics
 from ...geometry.rigid import invert_rigid
+from ...images.finding import image_stem
+from ...images.header import image_size
 from ..camera import Camera
+from ..image_files import GIVE_IMAGES, images_in_folder
 from ..parsing import numbers, read_text
 from ..source import CameraSource
 
@@ -61,9 +64,6 @@ def files_in(folder: Path) -> list[Path]:
 
 
 def _camera(file: Path, candidates: Sequence[Path]) -> Camera:
-    from ...images.header import image_size
-    from ..image_files import GIVE_IMAGES
-
     pose, K, depth_range = _parse(read_text(file))
     name = file.name
     for ending in ENDINGS:
@@ -105,8 +105,6 @@ def _depth_range(values: Sequence[float]) -> tuple[float, float] | None:
 
 
 def _image(name: str, candidates: Sequence[Path]) -> Path | None:
-    from ...images.io import image_stem
-
     for candidate in candidates:
         if image_stem(candidate) == name:
             return candidate
@@ -119,8 +117,6 @@ def _image(name: str, candidates: Sequence[Path]) -> Path | None:
 
 
 def _images_near(folder: Path) -> list[Path]:
-    from ..image_files import images_in_folder
-
     return [image for name in IMAGE_FOLDERS for image in images_in_folder(folder / name)]
 
 

@@ -14,6 +14,7 @@ from ...errors import InputError, error_context
 from ...geometry.intrinsics import intrinsic_matrix
 from ...system.files import check_regular
 from ..camera import Camera
+from ..image_files import images_in_folder
 from ..source import CameraSource
 
 DESCRIPTION = "LLFF's poses_bounds.npy"
@@ -84,8 +85,6 @@ def _names(count: int, folder: Path, images: Sequence[Path]) -> list[str]:
 
     Without images, the rows are numbered. Raises InputError if another number of images is given.
     """
-    from ..image_files import images_in_folder
-
     found = [
         sorted(images, key=lambda image: image.name),
         *(images_in_folder(folder / name) for name in IMAGE_FOLDERS),

@@ -15,8 +15,10 @@ import numpy as np
 from ...errors import InputError, error_context
 from ...geometry.intrinsics import from_opencv_pixels
 from ...geometry.rigid import invert_rigid
+from ...images.header import image_size
 from ...system.files import read_bytes
 from ..camera import Camera
+from ..image_files import GIVE_IMAGES
 from ..parsing import EXPECTED, MAX_FILE_SIZE
 from ..source import CameraSource
 
@@ -140,8 +142,6 @@ def _size(fields: dict[str, Any], images: Sequence[Path]) -> tuple[int, int]:
         if not (width.is_integer() and height.is_integer()):
             raise InputError(f"the image's size is {width:g} x {height:g}, expected whole pixels")
         return int(width), int(height)
-    from ...images.header import image_size
-    from ..image_files import GIVE_IMAGES
 
     if not images:
         raise InputError(f"has no {SIZE[0]}, and no image is given that tells it; {GIVE_IMAGES}")

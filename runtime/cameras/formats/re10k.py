@@ -15,6 +15,7 @@ from ...errors import InputError, error_context
 from ...geometry.intrinsics import denormalize_intrinsics, intrinsic_matrix
 from ...geometry.rigid import invert_rigid
 from ..camera import Camera
+from ..image_files import GIVE_IMAGES, ImageSizes
 from ..parsing import numbers, read_text
 from ..source import CameraSource
 
@@ -65,8 +66,6 @@ def _rows(path: Path) -> list[tuple[int, str, np.ndarray]]:
 
 def _size(names: Sequence[str], folder: Path, images: Sequence[Path]) -> tuple[int, int]:
     """The image size, of the first frame with an image: all frames are from one video."""
-    from ..image_files import GIVE_IMAGES, ImageSizes
-
     sizes = ImageSizes(folder, images)
     for name in names:
         size = sizes.size(name)

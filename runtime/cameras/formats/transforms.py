@@ -19,6 +19,7 @@ from ...errors import InputError, error_context
 from ...geometry.intrinsics import intrinsic_matrix
 from ...system.files import atomic_write
 from ..camera import Camera
+from ..image_files import ImageSizes
 from ..parsing import entries, image_name, number, pixels, pose, read_json, short_repr
 from ..source import CameraSource
 
@@ -147,8 +148,6 @@ class _Sizes:
 
     @cached_property
     def _found(self) -> "ImageSizes":
-        from ..image_files import ImageSizes  # imports OpenCV, which most of these files do not need
-
         return ImageSizes(self.folder, self.images)
 
     def size(self, name: str) -> tuple[int, int]:

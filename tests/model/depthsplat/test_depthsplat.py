@@ -147,7 +147,7 @@ def test_every_form_of_the_cost_volume_is_grid_sample_then_correlation(form):
     features = torch.randn(count, channels, height, width, generator=torch.Generator().manual_seed(1))
     candidates = torch.linspace(0.01, 2, 11)[None, :, None, None].expand(count, -1, height, width)
     neighbours = torch.tensor([[1, 2], [0, 3], [3, 1], [0, 2]])
-    pixels = denormalize_intrinsics(intrinsics, height, width)
+    pixels = denormalize_intrinsics(intrinsics, width, height)
     found = form(features, neighbours, *sampling_points(candidates, pixels, extrinsics, neighbours))
 
     x, y, front = project_candidates(candidates, pixels, extrinsics, neighbours)

@@ -13,13 +13,13 @@ import trimesh
 from conftest import run_command
 from idesplat.runtime.cameras.io import read_cameras
 from idesplat.runtime.cli.infer import main
-from idesplat.runtime.cli.outputs import Outputs
 from idesplat.runtime.cli.render import main as render_main
 from idesplat.runtime.cli.view import main as view_main
 from idesplat.runtime.inference.inputs import select_images
 from idesplat.runtime.splats.formats.ply import read_ply
 from idesplat.runtime.splats.io import read_splats
 from idesplat.runtime.system.files import atomic_write
+from idesplat.runtime.system.outputs import Outputs
 from idesplat.tools.synthetic.make_scene import make_scene
 
 

@@ -13,13 +13,14 @@ from idesplat.runtime.cameras.io import write_cameras
 from idesplat.runtime.cli.cameras import main as cameras_main
 from idesplat.runtime.cli.convert import main as convert
 from idesplat.runtime.cli.infer import main as infer
-from idesplat.runtime.cli.outputs import Outputs, outputs, write_json
+from idesplat.runtime.cli.outputs import write_json
 from idesplat.runtime.cli.render import main as render
 from idesplat.runtime.cli.view import main as view
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.images.naming import name_files
 from idesplat.runtime.system.files import atomic_write
 from idesplat.runtime.system.output_records import LEAST_STALE_LINES, read_record
+from idesplat.runtime.system.outputs import Outputs, outputs
 from scene_files import pinholes, snapshot, write_scene
 
 FIRST, SECOND = "000.png", "001.png"

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from idesplat.runtime.cameras.camera import Camera
 from idesplat.runtime.cameras.undistortion import undistort, undistortion_valid_mask
 from idesplat.runtime.errors import InputError
-from idesplat.runtime.images.io import describe_unsupported, find_images, load_image, unsupported_images
+from idesplat.runtime.images.finding import describe_unsupported, find_images, unsupported_images
+from idesplat.runtime.images.io import load_image
 from idesplat.runtime.images.resizing import cover_crop, resize_and_crop
 
 # rows of the upright picture, in RGB: red, green / blue, white / grey, black

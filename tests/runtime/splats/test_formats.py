@@ -19,7 +19,8 @@ from idesplat.runtime.rendering.rasterizer import rasterize
 from idesplat.runtime.splats.axes import GLTF
 from idesplat.runtime.splats.formats.ply import read_ply, write_ply
 from idesplat.runtime.splats.gaussians import Gaussians
-from idesplat.runtime.splats.io import FORMATS, MESH_ENDINGS, POINT_ENDINGS, read_splats, splat_suffix, write_splats
+from idesplat.runtime.splats.io import FORMATS, read_splats, splat_suffix, write_splats
+from idesplat.runtime.system.output_names import MESH_ENDINGS, POINT_ENDINGS
 from plyfile import PlyData
 from splat_cases import (
     ARRAYS,

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from idesplat.runtime.cameras.io import read_cameras
-from idesplat.runtime.images.io import find_images
+from idesplat.runtime.images.finding import find_images
 from idesplat.runtime.splats.points import unproject
 from idesplat.runtime.views.batch import match_images_to_cameras
 from idesplat.runtime.views.depth_range import DepthRange

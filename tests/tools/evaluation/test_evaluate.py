@@ -12,10 +12,11 @@ import pytest
 import torch
 from conftest import run_command
 from idesplat import Gaussians, InputError, Predictor, evaluate, rasterize, read_cameras
-from idesplat.runtime.cli.outputs import Outputs
-from idesplat.runtime.images.io import find_images, load_image
+from idesplat.runtime.images.finding import find_images
+from idesplat.runtime.images.io import load_image
 from idesplat.runtime.images.resizing import resize_and_crop
 from idesplat.runtime.system.files import atomic_write
+from idesplat.runtime.system.outputs import Outputs
 from idesplat.runtime.system.progress import Progress, reporting_to
 from idesplat.runtime.views.batch import match_images_to_cameras
 from idesplat.tools.evaluation import defaults, metrics

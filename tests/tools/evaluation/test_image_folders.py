@@ -11,7 +11,7 @@ import pytest
 from idesplat.runtime.cameras.camera import Camera
 from idesplat.runtime.cameras.io import read_cameras
 from idesplat.runtime.errors import InputError
-from idesplat.runtime.images.io import find_images
+from idesplat.runtime.images.finding import find_images
 from idesplat.runtime.views.batch import ViewBatch, build_view_batch, match_images_to_cameras
 from idesplat.runtime.views.depth_range import DepthRange
 from idesplat.tools.evaluation.image_folders import Frame, context_for, load_case, split_frames

@@ -23,7 +23,7 @@ from ....runtime.cameras.io import read_cameras, write_cameras
 from ....runtime.cli.terminal import run, say
 from ....runtime.errors import InputError
 from ....runtime.geometry.quaternions import matrices_to_quaternions
-from ....runtime.images.io import SUFFIXES
+from ....runtime.images.finding import SUFFIXES
 from ....runtime.sfm.estimate import estimate_cameras
 from ....runtime.system.files import atomic_write, make_folder
 from ....runtime.views.batch import match_images_to_cameras
