@@ -37,7 +37,7 @@ check: setup
 docs: setup
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet --site-dir site
 
-# Photographs of a drawn room to a splat, in demo/.
+# Images of a synthetic room to a splat, in demo/.
 demo: setup
 	$(BIN)/python -P -m idesplat.tools.figures.demo demo
 

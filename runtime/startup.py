@@ -1,4 +1,4 @@
-"""What has to be settled before any library is imported: `runtime`, `export` and `tools` import this module first."""
+"""Settings made before any library is imported: `runtime`, `export` and `tools` import this module first."""
 
 import os
 import sys
@@ -6,17 +6,17 @@ from contextlib import suppress
 
 from .system.cache_folder import cache_folder
 
-# ONNX Runtime would write a device id and a queue of events into the user's cache, and connect to its vendor. It reads
-# this when it is first imported; its function `disable_telemetry_events` comes too late.
+# Without this ONNX Runtime writes a device id and queued events to the user's cache, and connects to its vendor. The
+# variable is read on import; calling `disable_telemetry_events` afterwards would be too late.
 os.environ["ORT_DISABLE_TELEMETRY"] = "1"
 
-# numba would keep what it compiles beside our modules, or in a folder of its own in the user's cache, and PyTorch makes
+# By default numba caches compiled code beside our modules or in another folder of the user's cache, and PyTorch creates
 # a folder in the system's temporary folder, even if it compiles nothing.
 with suppress(RuntimeError):
     os.environ.setdefault("NUMBA_CACHE_DIR", str(cache_folder("numba")))
     os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(cache_folder("torch")))
 
-# `python -m` lets modules be imported from the current folder, which may hold anybody's files. Python itself has looked
-# there by now: only `python -P -m` keeps it from that.
+# `python -m` imports modules from the current folder, which may hold untrusted files. By now Python itself has already
+# searched it: only `python -P -m` prevents that.
 if sys.argv[:1] == ["-m"] and not sys.flags.safe_path:
     del sys.path[0]

@@ -1,1 +1,1 @@
-"""One module a command, and what the commands share."""
+"""The commands, one module each, and their shared modules."""

@@ -1,4 +1,4 @@
-"""The command `idesplat`: a group whose sub-commands are imported when they run, not to list them."""
+"""The command `idesplat`: a group whose sub-commands are imported when they run, not when they are listed."""
 
 from importlib import import_module
 from importlib.metadata import version
@@ -30,7 +30,7 @@ COMMANDS = {
     "cameras": SubCommand(".cameras", "app", "Estimate cameras, or convert them between formats."),
     "eval": SubCommand("...tools.evaluation.cli", "app", "Novel-view and depth metrics of a model."),
     "bench": SubCommand("...tools.benchmark.cli", "bench", "Time and memory of models."),
-    "train": SubCommand("...tools.training.cli", "train", "Train IDESplat on synthetic scenes or photographs."),
+    "train": SubCommand("...tools.training.cli", "train", "Train IDESplat on synthetic scenes or captures."),
 }
 
 

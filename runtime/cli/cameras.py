@@ -40,7 +40,7 @@ def estimate(
     verbose: Verbose = 0,
     quiet: Quiet = False,
 ) -> None:
-    """Estimate the cameras of images of one scene that does not move, as `idesplat infer` does where it finds none."""
+    """Estimate the cameras of images of one static scene, as `idesplat infer` does where it finds none."""
     from ..cameras.camera import named_from
     from ..cameras.io import write_cameras
     from ..images.finding import describe_unsupported

@@ -11,7 +11,7 @@ from ..system.files import read_bytes
 
 
 def read_config(context: typer.Context, path: Path | None) -> Path | None:
-    """Take what the file says as the defaults of the command's options; typer calls this before it reads others.
+    """Use the file's values as defaults of the command's options; typer calls this before it reads other options.
 
     Raises InputError for a file that is no TOML, an option that the command does not have, or a value of another kind.
     """
@@ -43,7 +43,7 @@ def _options(context: typer.Context) -> dict[str, Any]:
 
 
 def _value(path: Path, name: str, value: Any, option: Any) -> Any:
-    """What the command line would have given: words, of which typer makes numbers and paths itself."""
+    """The value as command-line strings, which typer converts to numbers and paths."""
     several = getattr(option, "multiple", False) or option.nargs == -1
     if getattr(option, "count", False) and isinstance(value, int) and not isinstance(value, bool):
         return value

@@ -23,10 +23,10 @@ def convert(
     verbose: Verbose = 0,
     quiet: Quiet = False,
 ) -> None:
-    """Write a splat file in another format, which follows from the file's name.
+    """Convert a splat file to the format that the output's suffix names.
 
     .ply, .compressed.ply, .splat, .spz, .sog and .glb are read and written; .points.ply, .points.glb, .obj and .xyz are
-    written as points. What a format cannot hold is named.
+    written as points. What a format cannot hold is reported.
     """
     from ..splats.filtering import describe_removed
     from ..splats.io import read_offset, read_splats, splat_suffix, write_splats

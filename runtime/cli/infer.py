@@ -190,7 +190,7 @@ def main() -> None:
 
 
 def _find_cameras(images: list[Path], cameras: str | None) -> "Found":
-    """The images to read, and where their cameras are: given, beside them, or nowhere."""
+    """The images to read and their cameras' path: given, found beside the images, or None."""
     from ..cameras.discovery import Found, find_cameras
 
     if cameras is None and not images:
@@ -214,7 +214,7 @@ def _named_after(images: list[Path]) -> Path:
 
 
 def _tell(result: "Reconstruction", targets: "Targets", seconds: dict[str, float], camera_format: str | None) -> None:
-    """Say what was chosen and written, and how to look at it."""
+    """Print what was chosen and written, and the commands that show it."""
     from ..splats.io import holds_splats
 
     span = result.depth_range

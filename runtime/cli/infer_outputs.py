@@ -24,13 +24,13 @@ from .outputs import STANDARD_OUTPUT, write_json
 from .reporting import note
 from .terminal import say
 
-# How many pixels COLMAP's fusion asks of a point unless told otherwise.
+# COLMAP's default of StereoFusion.min_num_pixels.
 COLMAP_MIN_PIXELS = 5
 
 
 @dataclass
 class Targets:
-    """What is to be written, by option. found: the images, and their cameras' file, if it is one."""
+    """The output files and folders, by option. found: the input images and the cameras' file, if there is one."""
 
     out: Path
     save_depth: Path | None
@@ -48,7 +48,7 @@ class Targets:
             self.save_cameras = self._beside(ESTIMATED_CAMERAS)
 
     def announce(self, model: Path) -> None:
-        """Announce what is read and written; raises InputError, before the work, where that does not go together."""
+        """Register inputs and outputs before the work; raises InputError if they conflict."""
         run = outputs()
         run.reads("the model", model_files(model))
         run.reads("an image", given_images(self.found.images))
@@ -65,9 +65,9 @@ class Targets:
                 run.writes_into(option, folder)
 
     def check_model(self, model: ModelFiles, filters: FilterOptions) -> None:
-        """Raise InputError, before the work, unless the model makes what is asked for.
+        """Raise InputError, before the work, if the model cannot produce a requested output.
 
-        Of a model that predicts depth alone, a name that may stand for splats or points stands for points.
+        For a model that predicts depth alone, .ply and .glb are written as points.
         """
         surface, gaussians = is_mesh(self.out), model.metadata.gaussians
         needs = [f"--out {self.out}"] * (holds_splats(self.out) and splat_suffix(self.out) not in POINT_SUFFIXES)
@@ -83,11 +83,11 @@ class Targets:
             )
         if self.depth_format is not None and self.save_depth is None and gaussians:
             raise InputError(f"--depth-format {self.depth_format}: give --save-depth, the folder to write to")
-        if not gaussians and self.save_depth is None:  # depth maps are what such a model is for
+        if not gaussians and self.save_depth is None:  # depth maps are such a model's main output
             self.save_depth = self._beside(DEPTH_FOLDER)
 
     def announce_views(self, inputs: Inputs) -> None:
-        """Announce the files that are named after views, now that these are chosen; raises InputError as `announce`."""
+        """Register the files named after the chosen views; raises InputError as `announce`."""
         run = outputs()
         run.reads("an image", inputs.images)
         if self.found.cameras is not None:
@@ -98,7 +98,7 @@ class Targets:
             run.writes("--render", render_files(self.render, inputs.views))
 
     def write(self, result: Reconstruction, filters: FilterOptions, started: float) -> dict[str, float]:
-        """Write everything; seconds by step. started: when the command did, by `time.perf_counter`."""
+        """Write all outputs; returns the seconds by step. started: `time.perf_counter` at the command's start."""
         writing = time.perf_counter()
         for line in result.save(self.out, filters.max_depth_jump or MAX_DEPTH_JUMP):
             note(f"note: {line}")
@@ -115,7 +115,7 @@ class Targets:
         now = time.perf_counter()
         seconds = result.timings | {"write": now - writing, "total": now - started}
         summary = result.summary([*self._written, *views], seconds)
-        summary["cleaned"]["asked"] = asdict(filters)
+        summary["filtered"]["asked"] = asdict(filters)
         if self.report is not None:
             result.save_report(self.report, summary)
             self._written.append(self.report)
@@ -126,7 +126,7 @@ class Targets:
         return seconds
 
     def tell_written(self, result: Reconstruction, seconds: dict[str, float]) -> None:
-        """Say which files and folders were written."""
+        """Print which files and folders were written."""
         for path in self._written:
             say(f"wrote {path}{self._described(result, seconds) if path == self.out else ''}")
         views = len(result.views.names)
@@ -143,12 +143,12 @@ class Targets:
             say(f"wrote {self.render}: {views} views and {PATH_FRAMES} frames of a path through them, as .png")
 
     def cameras_to_show(self, camera_format: str | None) -> list[str]:
-        """Options that give other commands the cameras that were given or found, or those that were kept."""
+        """The options that pass the cameras of this run, given, found or estimated, to other commands."""
         form = ["--camera-format", camera_format] if camera_format and self.found.cameras else []
         return ["--cameras", str(self.found.cameras or self.save_cameras), *form]
 
     def _described(self, result: Reconstruction, seconds: dict[str, float]) -> str:
-        """What the file of the scene holds, how large it is and how long it took, as the end of a line."""
+        """Number of Gaussians, file size and total time, as the end of a line."""
         splats = result.gaussians if holds_splats(self.out) else None
         count = "" if splats is None else f"{len(splats):,} Gaussians, "
         return f": {count}{self.out.stat().st_size / 1e6:.1f} MB, in {seconds['total']:.1f} s"
@@ -157,4 +157,5 @@ class Targets:
         return self.depth_format or DepthFormat.NPZ
 
     def _beside(self, ending: str) -> Path:
+        """The output's path with another ending."""
         return beside(self.out, splat_suffix(self.out), ending)

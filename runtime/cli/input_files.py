@@ -1,4 +1,4 @@
-"""Which files stand behind what a command is given, so that `outputs` can protect them all."""
+"""The files that a command's inputs consist of, which `outputs` protects from being replaced."""
 
 import glob
 import os
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from ..cameras.camera import Camera
 
-# Another folder where datasets keep images; commands read there only what they are given.
+# Another folder where datasets keep images; commands read it only if it is given.
 UNDISTORTED_FROM = "input"
 
 
@@ -22,14 +22,14 @@ def model_files(model: Path) -> list[Path]:
 
 
 def camera_files(cameras: Path) -> list[Path]:
-    """The files that are read where this file or folder is given as cameras."""
+    """The files that are read if this file or folder is given as cameras."""
     from ..cameras.io import input_files
 
     return [path for path in input_files(cameras) if os.path.isfile(path)]
 
 
 def given_images(given: Sequence[str | Path]) -> list[Path]:
-    """The images, or videos, that folders, globs and files stand for; nothing is said of what there is not."""
+    """The images and videos that folders, globs and files name; missing ones are skipped."""
     from ..images.finding import SUFFIXES
 
     found: list[Path] = []
@@ -54,7 +54,7 @@ def named_images(path: Path, cameras: Iterable["Camera"]) -> list[Path]:
 
 
 def nearby_images(path: Path, cameras: Iterable["Camera"]) -> list[Path]:
-    """The files that are most likely the images of the cameras: of their names, where datasets keep images.
+    """The likely images of the cameras: files with their names in the folders where datasets keep images.
 
     path: the file or folder that the cameras were read from, such as `sparse/0` beside a folder `images`.
     """
@@ -75,7 +75,7 @@ def nearby_images(path: Path, cameras: Iterable["Camera"]) -> list[Path]:
 
 
 def _children(folder: Path) -> list[Path]:
-    """What a folder holds; nothing where it cannot be read, or is none."""
+    """The entries of a folder; empty if it is not a readable folder."""
     try:
         return list(folder.iterdir())
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""What every command has around it: guarded outputs (see `system.outputs`), its log, and JSON on standard output."""
+"""The decorator of every command: checked outputs (`system.outputs`), logging, and JSON on standard output."""
 
 import functools
 import sys
@@ -11,11 +11,11 @@ from ..system.files import atomic_write
 from ..system.outputs import Outputs, outputs
 from .reporting import reporting
 
-STANDARD_OUTPUT = Path("-")  # as the value of --json
+STANDARD_OUTPUT = Path("-")  # the value of --json for standard output
 
 
 def command(name: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """What every command has: `outputs()` guard all that it writes, `--json -` keeps standard output for itself.
+    """Decorator of every command: checks outputs with `outputs()`, and reserves standard output for `--json -`.
 
     name: the command's. Of its parameters `overwrite`, `json_path`, `quiet` and `verbose` are used here.
     """

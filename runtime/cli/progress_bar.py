@@ -34,7 +34,7 @@ class _Display:
         self._shown: dict[str, rich_progress.Progress | Status] = {}
 
     def update(self, work: Progress) -> None:
-        """Show what a report says."""
+        """Show a report."""
         if work.ended:
             if shown := self._shown.pop(work.description, None):
                 shown.stop()
@@ -44,7 +44,7 @@ class _Display:
             self._start_spinner(work.description)
 
     def stop(self) -> None:
-        """Remove what is still shown, which interrupted work may have left."""
+        """Remove bars and spinners that interrupted work left."""
         while self._shown:
             self._shown.popitem()[1].stop()
 

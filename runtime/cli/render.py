@@ -42,9 +42,9 @@ from .outputs import command
 from .terminal import run, say
 
 COMMAND = "idesplat render"
-COLOUR = ""  # beside DEPTH and ALPHA: what an image shows, as its name ends
+COLOUR = ""  # beside DEPTH and ALPHA: the endings of the names of the kinds of images
 SOLID = 0.5  # alpha from which on a pixel has a depth
-SIZE = "360x640"  # where neither cameras nor --size say so
+SIZE = "360x640"  # without cameras and --size
 MOST_LISTED = 12  # files that are named one by one
 
 
@@ -82,7 +82,7 @@ def render(
     verbose: Verbose = 0,
     quiet: Quiet = False,
 ) -> None:
-    """Render a splat file from cameras, on a path through them, in an orbit, or from where all of it is seen.
+    """Render a splat file from cameras, on a path through them, in an orbit, or from an overview camera.
 
     Images are named after the cameras' images and have the cameras' own size. They show the ideal pinhole view: where
     a camera has lens distortion, compare with the undistorted image.
@@ -123,7 +123,7 @@ def main() -> None:
 
 
 def _check_out(out: Path) -> None:
-    """Refuse what is not made: a kind of image or video by its name, or any video where its library is missing."""
+    """Raise InputError for an unsupported suffix, or for a video if PyAV is not installed."""
     if out.suffix.lower() in {*SUFFIXES, *VIDEO_SUFFIXES, ".gif"} - {IMAGE, VIDEO} and not out.is_dir():
         raise InputError(f"--out {out}: expected a folder, or a file that ends in {IMAGE} or {VIDEO}")
     if out.suffix.lower() == VIDEO:
@@ -144,9 +144,9 @@ def _parse_background(text: str) -> tuple[float, float, float]:
 def _announce(
     scene: Path, cameras: Path | None, views: Sequence[Camera], stems: Sequence[Path], out: Path, kinds: Sequence[str]
 ) -> None:
-    """Say what is read and what will be written, so that nothing is replaced that must not be; raises InputError.
+    """Register inputs and outputs; raises InputError if they conflict.
 
-    The cameras' images are not read, but must not be replaced. What this command has rendered is none of them.
+    The cameras' images are not read, but must not be replaced. Images rendered by this command do not count.
     """
     run = outputs()
     run.reads("the scene", [scene])
@@ -172,7 +172,7 @@ def _image_path(stem: Path, kind: str) -> Path:
 
 
 def _metric_path(stem: Path) -> Path:
-    """Of the depth in world units."""
+    """Path of the depth in world units."""
     return kind_file(stem, DEPTH, ARRAYS)
 
 
@@ -253,7 +253,7 @@ def _save_images(
 
 
 def _depth(rendering: Rendering) -> np.ndarray:
-    """The mean depth of what stops the light, in world units, 0 where most of it passes."""
+    """Alpha-weighted mean depth in world units, 0 where alpha is below the threshold."""
     return np.where(rendering.alpha >= SOLID, rendering.depth / np.maximum(rendering.alpha, SOLID), 0).astype(
         np.float32
     )
@@ -267,7 +267,7 @@ def _image(rendering: Rendering, kind: str, limits: tuple[float, float] | None =
 
 
 def _stems(names: Sequence[str], out: Path, kinds: Sequence[str]) -> list[Path]:
-    """The images' paths without kind and suffix; raises InputError if several are to go into one file."""
+    """The images' paths without kind and suffix; raises InputError for several images and one file."""
     if out.suffix.lower() != IMAGE:
         return [out / name for name in name_files(names, kinds)]
     if len(names) > 1:

@@ -1,4 +1,4 @@
-"""What a command tells while it works: notes, and its log."""
+"""Notes and logging of a command."""
 
 import logging
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ _QUIET: ContextVar[bool] = ContextVar("_QUIET", default=False)
 
 @contextmanager
 def reporting(quiet: bool = False, verbose: int = 0) -> Iterator[None]:
-    """Leave out progress and notes if `quiet`; log to stderr what `verbose` asks for. Both while the block runs."""
+    """In the block, hide progress and notes if `quiet`, and log to stderr at the level of `verbose`."""
     token = _QUIET.set(quiet)
     try:
         with ExitStack() as stack:
@@ -28,7 +28,7 @@ def reporting(quiet: bool = False, verbose: int = 0) -> Iterator[None]:
 
 
 def note(*lines: str) -> None:
-    """Print lines that a user can do without, unless --quiet is given."""
+    """Print lines of secondary importance, unless --quiet is given."""
     if not _QUIET.get():
         say(*lines)
 

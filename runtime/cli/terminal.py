@@ -1,4 +1,4 @@
-"""What every command has in common: how it ends, what it prints, and what it keeps off the terminal."""
+"""What all commands share: exit status, printing, signals, and suppression of libraries' messages."""
 
 import contextlib
 import faulthandler
@@ -77,7 +77,7 @@ def say(*lines: str) -> None:
 
 
 def literal(text: str) -> str:
-    """Text for a rich table or status that shows a name as it is: brackets are no markup, nor is anything obeyed."""
+    """Text for a rich table or status without markup; control characters are escaped."""
     from rich.markup import escape
 
     return escape(printable(text))
@@ -91,8 +91,7 @@ def warn(text: str) -> None:
 def _status(app: typer.Typer) -> int:
     """Run the application; its exit status.
 
-    What is wrong with the input is printed as one line on stderr, and so is what the system refuses, and too little
-    memory.
+    InputError, OSError and MemoryError are printed as one line on stderr.
     """
     try:
         status = typer.main.get_command(app)(standalone_mode=False)
@@ -104,7 +103,7 @@ def _status(app: typer.Typer) -> int:
         status = _fail(str(error))
     except MemoryError:
         status = _fail("memory ran out; give a smaller file, fewer or smaller images, or use a larger machine")
-    except BrokenPipeError:  # whoever read the output has seen enough
+    except BrokenPipeError:  # the reader of the output has closed it
         status = BROKEN_PIPE
     except OSError as error:
         if error.strerror is None:  # not the system's
@@ -136,7 +135,7 @@ def _report_usage(error: Any) -> int:
 
 @contextlib.contextmanager
 def _ending_by_signals() -> Iterator[list[int]]:
-    """Let the signals that ask a process to end do so by an exception, so that what it was at is cleaned up.
+    """Let the signals that ask a process to end raise an exception, so that context managers clean up.
 
     Yields a list of those that came.
     """
@@ -164,7 +163,7 @@ def _ending_by_signals() -> Iterator[list[int]]:
 def _own_streams() -> Iterator[None]:
     """Standard streams that exist, take every character, and are written to the end.
 
-    Exits where standard output cannot be written: 2, or 141 without a word if its reader is gone.
+    Exits if standard output cannot be written: with 2, or silently with 141 if its reader is gone.
     """
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # closed by the caller
@@ -212,7 +211,7 @@ def _without_warnings() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _without_native_messages() -> Iterator[None]:
-    """Keep off the terminal what libraries write past Python, such as libpng's and FFmpeg's warnings.
+    """Hide what native libraries write to stderr, such as warnings of libpng and FFmpeg.
 
     They write to the file descriptor of stderr. It leads to a temporary file meanwhile, and Python's own stream to
     where it led before. The file's content is shown after an exception that is our mistake.

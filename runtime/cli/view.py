@@ -86,7 +86,7 @@ def main() -> None:
 
 @contextlib.contextmanager
 def _until_interrupted() -> Iterator[None]:
-    """Take Ctrl-C, by which a user ends this command, for its success; another signal is none."""
+    """Exit with status 0 on Ctrl-C, which ends this command; other signals are errors."""
     try:
         yield
     except Terminated:
@@ -96,7 +96,7 @@ def _until_interrupted() -> Iterator[None]:
 
 
 def _check_page(html: Path, scene: Path, cameras: Path | None, images: list[Path]) -> None:
-    """Find out before the work whether the page can be written, and is none of the files to read."""
+    """Check before the work that the page can be written and is none of the inputs."""
     from .input_files import camera_files, given_images
 
     if html.suffix.lower() not in (".html", ".htm") or html.is_dir():
@@ -118,9 +118,9 @@ def _relative(viewpoints: "list[Viewpoint]", scene: Path) -> "list[Viewpoint]":
 
 
 def read_viewpoints(cameras: Path | None, form: CameraFormat | None, images: list[Path]) -> "list[Viewpoint]":
-    """The cameras of the images, with these, without distortion; all cameras where there are no images.
+    """Undistorted images with their cameras; all cameras if no images are given.
 
-    Raises InputError for what cannot be read, or does not belong together.
+    Raises InputError for unreadable files, or images and cameras that do not match.
     """
     from ..cameras.io import read_cameras
     from ..system.files import scratch_folder
@@ -143,7 +143,7 @@ def read_viewpoints(cameras: Path | None, form: CameraFormat | None, images: lis
 
 
 def _viewpoint(file: Path, camera: "Camera") -> "Viewpoint":
-    """A camera with its image, without distortion."""
+    """A camera with its image, both undistorted."""
     from ..cameras.camera import resize_camera
     from ..cameras.undistortion import undistort
     from ..errors import error_context

@@ -1,4 +1,4 @@
-"""Color maps for depth, and conversions of color values."""
+"""Colour maps for depth, and conversions of colour values."""
 
 import numpy as np
 

@@ -1,1 +1,1 @@
-"""The whole flow in one function: images and cameras to depth, Gaussians and files."""
+"""Images and cameras to depth, Gaussians and files, in one function."""

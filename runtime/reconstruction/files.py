@@ -12,7 +12,7 @@ PATH_FRAMES = 24  # rendered on a path from the first view to the last
 
 
 def view_stems(views: ViewBatch) -> list[str]:
-    """A name for each view, without suffix, all different: those of the images, as far as they tell them apart."""
+    """Unique names of the views, without suffix, derived from the images' names."""
     return name_files([camera.name for camera in views.cameras])
 
 

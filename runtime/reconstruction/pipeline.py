@@ -56,9 +56,9 @@ def reconstruct(
     default, all that `select` names. size: height and width to work at instead of the trained size.
     near, far: bounds of depth in scene units; found from matched points or the baseline where not given.
     offset: "auto" or "X,Y,Z", subtracted from world coordinates that float32 does not hold.
-    on_inputs: is called with the chosen views before the model is loaded; what it raises ends the reconstruction.
-    progress: is told what is being done, see `Progress` in `idesplat.runtime.system.progress`.
-    Raises InputError for whatever cannot be used.
+    on_inputs: called with the chosen views before the model is loaded; its exceptions propagate.
+    progress: receives reports of progress, see `Progress` in `idesplat.runtime.system.progress`.
+    Raises InputError for invalid or unreadable inputs.
     """
     _check_depth_bounds(near, far)
     provider_name(provider)
@@ -104,7 +104,7 @@ def reconstruct(
 
 
 def _check_depth_bounds(near: float | None, far: float | None) -> None:
-    """What can be said of near and far before any image is read."""
+    """Check near and far before any image is read; raises InputError."""
     for name, value in (("--near", near), ("--far", far)):
         if value is not None and not 0 < value < float("inf"):
             raise InputError(f"{name} {value:g}: expected a positive depth in scene units")

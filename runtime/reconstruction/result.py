@@ -1,4 +1,4 @@
-"""What a reconstruction holds, and the files that it is saved as."""
+"""The result of a reconstruction, and its output files."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -34,11 +34,11 @@ from .files import PATH_FRAMES, render_files, view_stems
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """Depth, Gaussians and what they were made from.
+    """Depth and Gaussians, with the inputs and settings that they were computed from.
 
-    prediction: what the model yields, its Gaussians filtered. inputs: images, cameras and the views chosen of them.
-    model: the model's files. depth_range: near and far in scene units, and where they come from.
-    filters: those asked for. removed: how many Gaussians each of them took, by name.
+    prediction: the model's output, with filtered Gaussians. inputs: images, cameras and the chosen views.
+    model: the model's files. depth_range: near and far in scene units, and their source.
+    filters: the options. removed: number of Gaussians that each filter removed, by name.
     timings: seconds by step. notes: lines for the user.
     """
 
@@ -53,7 +53,7 @@ class Reconstruction:
 
     @property
     def gaussians(self) -> Gaussians | None:
-        """In world coordinates less `views.offset`; None from a model that predicts depth alone."""
+        """The Gaussians, in world coordinates minus `views.offset`; None for a model that predicts depth alone."""
         return self.prediction.gaussians
 
     @property
@@ -68,18 +68,18 @@ class Reconstruction:
 
     @property
     def views(self) -> ViewBatch:
-        """The images that were used, as the network takes them, with their full-size cameras."""
+        """The images used, as the network's input, with their full-size cameras."""
         return self.inputs.views
 
     @property
     def metadata(self) -> ModelMetadata:
-        """What the model's file says of itself."""
+        """The model's metadata."""
         return self.model.metadata
 
     def save(self, path: Path | str, max_depth_jump: float = MAX_DEPTH_JUMP) -> list[str]:
-        """Write splats, points or a surface, as the file's name asks for; lines that tell what the format cannot hold.
+        """Write splats, points or a surface, by the file's suffix; returns a line for each loss of the format.
 
-        max_depth_jump: of a surface, the relative difference of depth between neighbouring pixels across which no
+        max_depth_jump: for a surface, the relative difference of depth between neighbouring pixels across which no
         triangle is made. Raises InputError if the file cannot be written.
         """
         path = Path(path)
@@ -126,7 +126,7 @@ class Reconstruction:
         write_report(Path(path), self.depth, self.prediction.need_gaussians(), self.views, summary)
 
     def summary(self, files: Sequence[Path] = (), seconds: dict[str, float] | None = None) -> dict[str, Any]:
-        """What was done, as JSON can hold it. files: those written. seconds: instead of `timings`."""
+        """A summary that JSON can hold. files: the written files. seconds: instead of `timings`."""
         percentiles = np.percentile(self.depth, (0, 50, 100)).tolist()
         return {
             "model": {"path": str(self.model.path), **asdict(self.metadata)},
@@ -143,5 +143,5 @@ class Reconstruction:
             "seconds": seconds or self.timings,
             "files": [str(path) for path in files],
             "offset": self.views.offset.tolist(),
-            "cleaned": {"asked": asdict(self.filters), "left_out": self.removed},
+            "filtered": {"asked": asdict(self.filters), "left_out": self.removed},
         }

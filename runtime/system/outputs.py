@@ -1,10 +1,10 @@
-"""What a run reads and what it writes, known in one place, so that no file is lost.
+"""Registry of a run's inputs and outputs, which keeps files from being replaced by mistake.
 
-An output is refused if it is a file that the same run reads, if it is another output of the run, or if it exists and
-no command of ours wrote it (see `output_records`). The option --overwrite lifts the last of these alone.
+An output is refused if the same run reads the file, if it is another output of the run, or if it exists and was not
+written by one of our commands (`output_records`). The option --overwrite lifts only the last restriction.
 
-Inside the context of `Outputs`, `outputs()` takes the run's inputs and outputs as soon as they are known. Whatever is
-written through `atomic_write` without having been announced is checked then.
+Inside the context of `Outputs`, inputs and outputs are registered with `outputs()` as soon as they are known. Files
+that `atomic_write` writes without registration are checked when they are written.
 """
 
 import itertools
@@ -26,16 +26,15 @@ from .output_records import WrittenFile, add_to_record, is_unchanged, read_recor
 class Outputs:
     """The files that one run of a command reads and writes.
 
-    command: its name, for the record of what it wrote. overwrite: whether files that no command wrote may be replaced.
-    As a context, it is asked before every write, and removes the folders that it made if the run fails and left them
-    empty.
+    command: its name, for the record of written files. overwrite: whether other existing files may be replaced.
+    As a context manager it checks every write, and removes the empty folders that it created if the run fails.
     """
 
     def __init__(self, command: str, overwrite: bool = False) -> None:
         self.command, self.overwrite = command, overwrite
         self.stdout: TextIO = sys.stdout
         self._inputs: dict[object, tuple[Path, str]] = {}  # by identity: the path, and what it is
-        self._outputs: dict[object, tuple[Path, str]] = {}  # likewise: the path, and its option
+        self._outputs: dict[object, tuple[Path, str]] = {}  # by identity: the path, and its option
         self._folders: dict[object, str] = {}  # folders that hold outputs, and theirs: the option
         self._checked: set[Path] = set()  # folders that are known to hold outputs
         self._records: dict[Path, dict[str, WrittenFile]] = {}
@@ -54,11 +53,11 @@ class Outputs:
         self._contexts.close()
         if kind is not None:
             for folder in reversed(self._made):
-                with suppress(OSError):  # it holds something by now
+                with suppress(OSError):  # it is not empty any more
                     folder.rmdir()
 
     def reads(self, what: str, paths: Iterable[Path]) -> None:
-        """Announce files that the run reads, and what they are, such as "an image"; absent ones count, too.
+        """Register files that the run reads, and what they are, such as "an image"; they need not exist.
 
         Raises InputError if one of them is an output.
         """
@@ -70,9 +69,9 @@ class Outputs:
                 self._inputs.setdefault(key, (path, what))
 
     def writes(self, option: str, paths: Iterable[Path], known: bool = False) -> None:
-        """Announce files that the run will write, and the option that asks for them.
+        """Register files that the run will write, and the option that requests them.
 
-        known: existing ones are known to be of this run, by what stands in them.
+        known: existing files belong to this run, as their content shows.
         Raises InputError, before anything is written, if one of them must not be written, or cannot be.
         """
         strangers = []
@@ -94,7 +93,7 @@ class Outputs:
             )
 
     def writes_into(self, option: str, folder: Path) -> None:
-        """Announce a folder for files whose names are not known yet; raises InputError if it cannot be one."""
+        """Register a folder for files whose names are not known yet; raises InputError if it cannot be created."""
         folder = Path(folder)
         with _refusing_bad_names(folder):
             if os.path.lexists(folder) and not folder.is_dir():
@@ -102,7 +101,7 @@ class Outputs:
         self._add_folder(option, folder)
 
     def writer_of(self, path: Path) -> str | None:
-        """The command of ours that wrote a file, if that has not been changed since."""
+        """The command that wrote a file, or None if no command did or the file was changed since."""
         folder = Path(path).parent
         if folder not in self._records:
             self._records[folder] = read_record(folder)
@@ -110,7 +109,7 @@ class Outputs:
         return entry.command if entry is not None and is_unchanged(Path(path), entry) else None
 
     def check(self, path: Path) -> None:
-        """Check a file that is about to be written, unless it was announced, and make its folder."""
+        """Check a file that is about to be written, unless it was registered, and create its folder."""
         if self._comparable(path) not in self._outputs:
             self.writes("", [path])
         self.make_folder(Path(path).parent)
@@ -130,7 +129,7 @@ class Outputs:
             self._made.append(place)
 
     def _add(self, option: str, path: Path, keys: Sequence[object]) -> None:
-        """Take up an output that is no input; raises InputError if it is another output, or in the place of one."""
+        """Add an output that is not an input; raises InputError if it conflicts with another output."""
         comparable = self._comparable(path)
         for key in (comparable, *keys):
             if key in self._outputs:
@@ -142,7 +141,7 @@ class Outputs:
             self._outputs[key] = path, option or str(path)
 
     def _add_folder(self, option: str, folder: Path) -> None:
-        """Take up a folder of outputs; raises InputError if it cannot be made, or an output is to be in its place."""
+        """Add a folder of outputs; raises InputError if it cannot be created or an output has its path."""
         if folder in self._checked:
             return
         for place in (folder, *folder.parents):
@@ -159,7 +158,7 @@ class Outputs:
         return "output", without_case(self._real(path))
 
     def _identities(self, path: Path) -> list[object]:
-        """The keys under which a path is known: where it leads, and, if there is a file, which one that is."""
+        """Keys that identify a path: the resolved path and, for an existing file, its device and inode."""
         keys: list[object] = [self._real(path)]
         with _refusing_bad_names(path), suppress(OSError):
             status = os.stat(path)
@@ -167,7 +166,7 @@ class Outputs:
         return keys
 
     def _real(self, path: Path) -> str:
-        """The path without links and dots; of many files in one folder, that is looked up once."""
+        """The resolved path; folders are resolved once and cached."""
         with _refusing_bad_names(path):
             if path.name in ("", "..") or os.path.islink(path):
                 return os.path.realpath(path)
@@ -183,7 +182,7 @@ _CURRENT: ContextVar[Outputs | None] = ContextVar("_CURRENT", default=None)
 
 
 def outputs() -> Outputs:
-    """Those of the running command; where no command runs, ones that guard nothing else."""
+    """The `Outputs` of the running command; outside of commands a new one without registered files."""
     return _CURRENT.get() or Outputs("idesplat")
 
 
@@ -207,7 +206,7 @@ def _existing(option: str, path: Path) -> bool:
             return False
         except OSError as error:
             raise InputError(f"{_named(option)}{path}: cannot be written ({error.strerror}); choose another") from None
-        with suppress(OSError):  # a link that leads nowhere remains one
+        with suppress(OSError):  # a dangling link is kept as it is
             mode = path.stat().st_mode
     if stat.S_ISDIR(mode):
         raise InputError(f"{_named(option)}{path}: is a folder, expected a file to write")

@@ -1,4 +1,4 @@
-"""Progress of long work, reported to a callback; without one, as in library use, nothing is drawn or printed."""
+"""Progress of long work, reported to a callback; without one, as in library use, nothing is printed."""
 
 from collections.abc import Callable, Iterable, Iterator, Sized
 from contextlib import contextmanager

@@ -53,7 +53,7 @@ class Viewpoint(NamedTuple):
     """A camera without distortion, and its image, uint8 RGB [height, width, 3], if it is to be shown."""
 
     camera: Camera
-    photograph: np.ndarray | None
+    image: np.ndarray | None
 
 
 @contextlib.contextmanager
@@ -161,7 +161,7 @@ def _add_frustum(server: "viser.ViserServer", index: int, view: Viewpoint) -> "v
     # viser scales a pyramid of volume 4 / 9, whatever its angles
     scale = FRUSTUM_DEPTH * float(np.cbrt(math.tan(fov / 2) ** 2 * aspect / 3))
     return server.scene.add_camera_frustum(
-        f"/photographs/{index} {PurePosixPath(camera.name).name}",
+        f"/images/{index} {PurePosixPath(camera.name).name}",
         fov,
         aspect,
         scale=scale,

@@ -39,8 +39,8 @@ STAGES = {
 def network(name):
     """A small network with random weights as in the reference cases."""
     model = build(NETWORKS[name]).eval()
-    drawn = {key: random_tensor(key, tuple(value.shape), seed=1, gain=1.0) for key, value in model.state_dict().items()}
-    model.load_state_dict({key: torch.from_numpy(np.array(value, np.float32)) for key, value in drawn.items()})
+    state = {key: random_tensor(key, tuple(value.shape), seed=1, gain=1.0) for key, value in model.state_dict().items()}
+    model.load_state_dict({key: torch.from_numpy(np.array(value, np.float32)) for key, value in state.items()})
     return model
 
 
@@ -165,7 +165,7 @@ def test_depth_maps_go_where_they_are_wanted(given):
     "asked",
     (
         ("--out", "scene.spz"),
-        ("--out", "scene.ply", "--render", "drawn"),
+        ("--out", "scene.ply", "--render", "renders"),
         ("--out", "scene.ply", "--report", "report.html"),
         ("--out", "scene.ply", "--min-opacity", "0.1"),
     ),

@@ -49,15 +49,15 @@ class Command:
 
 POSED = ("images/000.png", "images/001.png", "transforms.json")
 MODEL = "--model model.onnx --near 1 --far 10"
-PHOTOGRAPHS = "--images images --cameras transforms.json"
+IMAGES = "--images images --cameras transforms.json"
 COMMANDS = {
     "infer": Command(
-        infer.infer, infer.main, f"{PHOTOGRAPHS} {MODEL} --size 32x48 --out out/a.ply", (*POSED, "model.onnx"), 20
+        infer.infer, infer.main, f"{IMAGES} {MODEL} --size 32x48 --out out/a.ply", (*POSED, "model.onnx"), 20
     ),
     "infer all": Command(
         infer.infer,
         infer.main,
-        f"{PHOTOGRAPHS} {MODEL} --size 32x48 --views 2 --offset auto --out out/a.spz --save-depth out/depth "
+        f"{IMAGES} {MODEL} --size 32x48 --views 2 --offset auto --out out/a.spz --save-depth out/depth "
         "--json out/a.json --report out/a.html --save-cameras out/c.json",
         (*POSED, "model.onnx"),
         6,
@@ -91,7 +91,7 @@ COMMANDS = {
         ("images/000.png", "images/001.png"),
         10,
     ),
-    "view": Command(view.view, view.main, f"scene.ply {PHOTOGRAPHS} --html out/a.html", ("scene.ply", *POSED), 15),
+    "view": Command(view.view, view.main, f"scene.ply {IMAGES} --html out/a.html", ("scene.ply", *POSED), 15),
     "export": Command(
         export.export,
         export.main,
@@ -114,10 +114,10 @@ COMMANDS = {
         ("chunks/0.torch", "index.json", "model.onnx"),
         15,
     ),
-    "eval procedural": Command(
-        evaluate.procedural,
+    "eval synthetic": Command(
+        evaluate.synthetic,
         evaluate.main,
-        "procedural --model missing.onnx --out out --scenes 1 --size 32x48",
+        "synthetic --model missing.onnx --out out --scenes 1 --size 32x48",
         (),
         15,
     ),

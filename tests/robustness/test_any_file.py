@@ -1,4 +1,4 @@
-"""Whatever a file holds, its reader gives what it promises or one line of an InputError. See docs/security.md."""
+"""Readers of any content return valid values or raise a one-line InputError. See docs/security.md."""
 
 import json
 import os

@@ -152,9 +152,9 @@ def test_nothing_but_our_cache_is_left_behind(scene, tmp_path):
         folder.mkdir()
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("XDG_", "NUMBA_", "ORT_"))}
     environment |= {"HOME": str(home), "TMPDIR": str(temporary)}
-    photographs = ("--images", scene / "images", "--cameras", scene / "transforms.json")
+    given = ("--images", scene / "images", "--cameras", scene / "transforms.json")
     options = {"env": environment, "cwd": work}
-    made = call("idesplat.runtime.cli.infer", *photographs, "--out", "scene.ply", **options)
+    made = call("idesplat.runtime.cli.infer", *given, "--out", "scene.ply", **options)
     assert made.returncode == 0, made.stderr
     assert {str(path.relative_to(home)) for path in home.glob("*/*")} == {".cache/idesplat"}
     assert not list(temporary.iterdir())
@@ -209,7 +209,7 @@ def test_what_killed_processes_left_is_collected(tmp_path):
         writing.kill()
         writing.communicate()
     assert left[0].exists()
-    own = tmp_path / ".idesplat-tmp-photographs-of-mine"  # no name that we give
+    own = tmp_path / ".idesplat-tmp-images-of-mine"  # no name that we give
     own.mkdir()
     write_elsewhere(tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == [own.name, "other"]

@@ -1,4 +1,4 @@
-"""Every variant on every reference case: how far from the release's arrays, at what price; a table of docs/parity.md.
+"""Every variant on every reference case: error against the release, and relative time; a table of docs/parity.md.
 
 PYTHONPATH=tests/support python tests/support/measure_parity.py
 """
@@ -97,9 +97,9 @@ def report(case: str, runs: dict[str, Run], stages: dict[str, float | None]) -> 
             run()
             seconds[name].append(time.perf_counter() - started)
     for name, result in found.items():
-        price = np.median(np.divide(seconds[name], seconds["PyTorch"]))
+        ratio = np.median(np.divide(seconds[name], seconds["PyTorch"]))
         stage = "" if stages[name] is None else f"{stages[name]:.1e}"
-        table.add_row(name, *departure(case, result), stage, f"{price:.2f}")
+        table.add_row(name, *departure(case, result), stage, f"{ratio:.2f}")
     Console(width=120).print(table)
 
 

@@ -41,7 +41,7 @@ def box(truth: Gaussians, *steps: int) -> tuple[float, ...]:
 
 
 def our_bounds(suffix: str, truth: Gaussians) -> Bounds:
-    """What the module of each format promises; 1e-6 for float32."""
+    """The error bounds that the module of each format documents; 1e-6 for float32."""
     # The largest part of a quaternion is the root of what the smallest leave: it is off by up to three times as much.
     smallest_three_bound = 3 * 7e-4
     match suffix:

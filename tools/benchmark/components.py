@@ -117,7 +117,7 @@ def _files(folder: Path, verb: str) -> Candidates:
 
 
 def plain_file(folder: Path, verb: str) -> Prepared:
-    """A file of as many bytes as a .ply file: the time of disk and memory alone."""
+    """A plain file of the same size as the .ply file, to time disk and memory alone."""
     path, table = folder / "plain.bin", np.random.default_rng(0).random((FILE_SPLATS, PLY_COLUMNS), np.float32)
 
     def write() -> None:

@@ -16,7 +16,7 @@ from ...runtime.errors import InputError
 from ...runtime.system.files import read_bytes
 
 VERSION = 2  # of the JSON's layout; version 1 had no such field
-WIDTH = 150  # columns, where the output is no terminal
+WIDTH = 150  # columns, if the output is not a terminal
 SHOWN = 7  # operators of a row
 # Medians within this factor are not a regression, whatever the spread.
 TOLERANCE = 1.05
@@ -155,7 +155,7 @@ def _verdicts(row: Row, old: Row) -> list[str]:
 
 
 def _numbers(row: Row) -> list[str]:
-    """A row's cells from the column seconds on."""
+    """A row's cells from the column of seconds on."""
     low, median, high = np.percentile(row.seconds, (25, 50, 75))
     return [
         f"{median:.3g}",

@@ -29,7 +29,7 @@ OnStatus = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Settings:
-    """How every candidate is run; eager: whether the same networks are run in PyTorch, too."""
+    """Settings of all candidates. eager: whether the same networks also run in PyTorch."""
 
     threads: int
     repeats: int
@@ -134,7 +134,7 @@ def _model_candidates(models: Sequence[Path], providers: Sequence[str], on_statu
 def _workloads(
     candidates: Sequence[ModelCandidate], view_counts: Sequence[int], sizes: Sequence[tuple[int, int]]
 ) -> Iterator[tuple[Workload, list[ModelCandidate]]]:
-    """What is compared: all models at each size that was asked for, or else those with the same own size."""
+    """The workloads: all models at each given size, or the models grouped by their own size."""
     groups: dict[tuple[int, int], list[ModelCandidate]] = {size: list(candidates) for size in sizes}
     if not sizes:
         for candidate in candidates:
@@ -211,7 +211,7 @@ def _run_once(row: Row, worker: Worker, reference: Worker) -> None:
 
 @contextmanager
 def _noting_failure(row: Row) -> Iterator[None]:
-    """Take a candidate that fails out of the benchmark; its row says why."""
+    """Remove a failing candidate from the benchmark; its row keeps the reason."""
     try:
         yield
     except Failed as problem:

@@ -47,14 +47,14 @@ class Run(NamedTuple):
 
 
 class Failed(Exception):
-    """A candidate cannot run; the message says why."""
+    """Raised if a candidate cannot run; the message has the reason."""
 
 
 Prepared = tuple[Any, Callable[[], Any]]
 
 
 class Worker:
-    """A candidate's process, as the measuring process sees it."""
+    """Handle of a candidate's process."""
 
     def __init__(self, prepare: Callable[..., Prepared], *arguments: Any) -> None:
         """Call `prepare` in a new process; `about` holds the first of its results, the second is run. Raises Failed."""
@@ -72,7 +72,7 @@ class Worker:
         return self._answer()
 
     def finish(self) -> int | None:
-        """End the process; returns its peak memory in bytes, None where the system does not tell. Raises Failed."""
+        """End the process; returns its peak memory in bytes, None if it is unknown. Raises Failed."""
         self._pipe.send(None)
         peak = self._answer()
         self._process.join()
@@ -82,7 +82,7 @@ class Worker:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End the process, in whatever state."""
+        """Kill the process if it still runs."""
         self._process.kill()
         self._process.join()
 

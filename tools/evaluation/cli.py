@@ -24,7 +24,7 @@ if TYPE_CHECKING:  # nothing heavy is loaded before there is something to evalua
     from .evaluate import Evaluation
     from .novel_views import Result
 
-# Scenes whose strips `chunks` and `procedural` write.
+# Scenes whose strips `chunks` and `synthetic` write.
 SCENES_WITH_STRIPS = 8
 
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for results.json and images.", show_default=False)]
@@ -119,8 +119,8 @@ def chunks(
 
 
 @app.command()
-@command("idesplat eval procedural")
-def procedural(
+@command("idesplat eval synthetic")
+def synthetic(
     out: Out,
     model: Model = None,
     scenes: Annotated[
@@ -152,7 +152,7 @@ def procedural(
     )
     pool = pool_views or views
     print_means(result.mean, f"{scenes} held-out synthetic scenes, {views} of {pool} views, {_by(result.size)}")
-    _write(out, {"command": "procedural", "views": views, "pool_views": pool}, result)
+    _write(out, {"command": "synthetic", "views": views, "pool_views": pool}, result)
 
 
 @app.command()

@@ -22,7 +22,7 @@ ANY_KINDS = (
     *("glyphs", "gradient", "cells", "weave", "strokes", "collage"),
 )
 
-# Probability that a material has a texture from a photograph, if there are any.
+# Probability that a material has a texture cropped from an image, if there are any.
 PHOTO_PROBABILITY = 0.5
 
 
@@ -65,11 +65,11 @@ class SceneBuilder:
         uv = np.array([[cos, -sin, rng.random()], [sin, cos, rng.random()]])
         contrast = rng.uniform(0.5, 1.0)
         mix = np.eye(3) if rng.random() < 0.5 else np.eye(3)[rng.permutation(3)]
-        color = np.empty((3, 4))
-        color[:, :3] = mix * (contrast * rng.uniform(0.85, 1.1, 3))[:, None]
-        color[:, 3] = (1 - contrast) * rng.uniform(0.1, 0.9)
+        colour = np.empty((3, 4))
+        colour[:, :3] = mix * (contrast * rng.uniform(0.85, 1.1, 3))[:, None]
+        colour[:, 3] = (1 - contrast) * rng.uniform(0.1, 0.9)
         specular = rng.uniform(0.05, 0.35) if rng.random() < 0.2 else 0.0
-        self.materials.append((texture, uv, color, specular, emission))
+        self.materials.append((texture, uv, colour, specular, emission))
         return len(self.materials) - 1
 
     def add(
@@ -95,10 +95,10 @@ class SceneBuilder:
         self.add(BOX, (x, y, z), (half_x, half_y, half_z), material)
 
     def scene(self, lights: list[tuple[np.ndarray, np.ndarray, float, float]], ambient: np.ndarray) -> Scene:
-        """The scene with all solids that were added. lights: (position, color, reach, half length), as in `Scene`."""
+        """The scene with all solids that were added. lights: (position, colour, reach, half length), as in `Scene`."""
         shapes, centres, axes, halves, faces = zip(*self.solids, strict=True)
-        textures, uv, colors, speculars, emissions = zip(*self.materials, strict=True)
-        positions, light_colors, reaches, lengths = zip(*lights, strict=True)
+        textures, uv, colours, speculars, emissions = zip(*self.materials, strict=True)
+        positions, light_colours, reaches, lengths = zip(*lights, strict=True)
         return Scene(
             np.array(shapes),
             np.array(centres),
@@ -107,12 +107,12 @@ class SceneBuilder:
             np.array(faces),
             np.array(textures),
             np.array(uv),
-            np.array(colors),
+            np.array(colours),
             np.linalg.norm(np.array(uv)[:, :, 0], axis=1),
             np.array(speculars),
             np.array(emissions),
             np.array(positions),
-            np.array(light_colors),
+            np.array(light_colours),
             np.array(reaches, float),
             np.array(lengths, float),
             ambient,
@@ -147,8 +147,8 @@ def sunlit_scene(builder: SceneBuilder) -> Scene:
     rng = builder.rng
     sun = rng.normal(0, 1, 3) * (1, 0.3, 1) - (0, 1.2, 0)
     half_length = 6.0 if rng.random() < 0.4 else -1.0
-    lights = [(200 * sun / np.linalg.norm(sun), rng.uniform(0.5, 0.8) * _light_color(rng), 1e9, half_length)]
-    return builder.scene(lights, rng.uniform(0.35, 0.55) * _light_color(rng))
+    lights = [(200 * sun / np.linalg.norm(sun), rng.uniform(0.5, 0.8) * _light_colour(rng), 1e9, half_length)]
+    return builder.scene(lights, rng.uniform(0.35, 0.55) * _light_colour(rng))
 
 
 def lamplit_scene(builder: SceneBuilder, width: float, height: float, length: float) -> Scene:
@@ -161,13 +161,13 @@ def lamplit_scene(builder: SceneBuilder, width: float, height: float, length: fl
         position = np.array([rng.uniform(-0.3, 0.3) * width, -0.93 * height, rng.uniform(-0.3, 0.3) * length])
         half_length = rng.uniform(0.02, 0.2) if shadows and index == 0 else -1.0
         lights.append(
-            (position, rng.uniform(0.5, 0.95) / count**0.5 * _light_color(rng), rng.uniform(2.5, 6.0), half_length)
+            (position, rng.uniform(0.5, 0.95) / count**0.5 * _light_colour(rng), rng.uniform(2.5, 6.0), half_length)
         )
-    return builder.scene(lights, rng.uniform(0.35, 0.6) * _light_color(rng))
+    return builder.scene(lights, rng.uniform(0.35, 0.6) * _light_colour(rng))
 
 
-def _light_color(rng: np.random.Generator) -> np.ndarray:
-    """The color of a light, from cool to warm."""
+def _light_colour(rng: np.random.Generator) -> np.ndarray:
+    """The colour of a light, from cool to warm."""
     warmth = rng.normal(0, 0.08)
     return np.array([1 + warmth, 1.0, 1 - warmth])
 

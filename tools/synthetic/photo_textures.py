@@ -1,4 +1,4 @@
-"""Textures from photographs: crops of the images in a folder."""
+"""Textures cropped from the images in a folder."""
 
 from collections.abc import Iterator
 from functools import cache
@@ -18,7 +18,7 @@ WHITE_QUANTILE, GAMMA = 0.95, 2.2
 MAX_CROPS, PIXELS_PER_CROP = 4, 512 * 512
 # Crops in all; each takes 256 KiB.
 MAX_TEXTURES = 400
-# Least standard deviation of a crop's gray values; generated textures serve as well below it.
+# Least standard deviation of a crop's grey values; generated textures serve as well below it.
 MIN_CONTRAST = 0.03
 
 
@@ -55,9 +55,9 @@ def _crops(path: Path, index: int) -> Iterator[np.ndarray]:
         side = int(np.exp(rng.uniform(np.log(SIZE), np.log(min(height, width)))))
         top, left = int(rng.integers(height - side + 1)), int(rng.integers(width - side + 1))
         crop = cv2.resize(image[top : top + side, left : left + side], (SIZE, SIZE), interpolation=cv2.INTER_AREA)
-        colors = crop[..., ::-1].astype(np.float32) / 255
-        if colors.mean(axis=2).std() >= MIN_CONTRAST:
-            yield colors
+        colours = crop[..., ::-1].astype(np.float32) / 255
+        if colours.mean(axis=2).std() >= MIN_CONTRAST:
+            yield colours
 
 
 def _read(path: Path) -> np.ndarray | None:

@@ -1,4 +1,4 @@
-"""A compiled ray caster: exact z-depth and antialiased color of boxes, ellipsoids and cylinders.
+"""A compiled ray caster: exact z-depth and antialiased colour of boxes, ellipsoids and cylinders.
 
 Ray directions have z = 1 in the camera frame, so that the ray parameter is the z-depth. Each solid is a unit cube, ball
 or cylinder in its own frame, scaled by `halves`. For each tile of the image only the solids whose bounding rectangle
@@ -39,11 +39,11 @@ def cast_rays(
     image: np.ndarray,
     depth: np.ndarray,
 ) -> None:
-    """Fill `depth` [H, W] with the z-depth at pixel centres and `image` [H, W, 3] with color, in which 1 is white.
+    """Fill `depth` [H, W] with the z-depth at pixel centres and `image` [H, W, 3] with colour, in which 1 is white.
 
     texels: `Textures.texels`. camera_to_world: [4, 4], OpenCV axes. camera: focal lengths and
     centre in pixels, (fx, fy, cx, cy).
-    offsets: the color samples' positions inside a pixel, [samples, 2] in [0, 1); with none, `image` is unchanged.
+    offsets: the colour samples' positions inside a pixel, [samples, 2] in [0, 1); with none, `image` is unchanged.
     """
     count = len(scene.shapes)
     origins, directions = np.empty((count, 3)), np.empty((count, 3, 3))
@@ -154,14 +154,14 @@ def _cast(
                     depth[row, column] = z
                     if len(offsets) > 0:
                         pixel = (column - centre_x, row - centre_y, focal_x, focal_y)
-                        red, green, blue = _pixel_color(
+                        red, green, blue = _pixel_colour(
                             scene, texels, camera_to_world, origins, directions, nearest, solids, tried, offsets, pixel
                         )
                         image[row, column, 0], image[row, column, 1], image[row, column, 2] = red, green, blue
 
 
 @_inlined()
-def _pixel_color(
+def _pixel_colour(
     scene: Scene,
     texels: np.ndarray,
     camera_to_world: np.ndarray,
@@ -173,7 +173,7 @@ def _pixel_color(
     offsets: np.ndarray,
     pixel: tuple[float, float, float, float],
 ) -> tuple[float, float, float]:
-    """The mean color of a pixel's samples. pixel: its corner relative to the principal point, and the focal lengths.
+    """The mean colour of a pixel's samples. pixel: its corner relative to the principal point, and the focal lengths.
 
     Every sample looks up the texture; light is computed once for consecutive samples on the same face.
     """
@@ -340,9 +340,9 @@ def _light(
         strength = 1.0 / (1.0 + relative * relative)
         if scene.light_lengths[light] >= 0.0:
             strength *= _lamp_visibility(scene, light, px, py, pz, nx, ny, nz)
-        light_r += strength * cosine * scene.light_colors[light, 0]
-        light_g += strength * cosine * scene.light_colors[light, 1]
-        light_b += strength * cosine * scene.light_colors[light, 2]
+        light_r += strength * cosine * scene.light_colours[light, 0]
+        light_g += strength * cosine * scene.light_colours[light, 1]
+        light_b += strength * cosine * scene.light_colours[light, 2]
         if scene.speculars[material] > 0.0:  # Phong: the reflected ray towards the light
             mirrored = ((rx - 2 * slope * nx) * vx + (ry - 2 * slope * ny) * vy + (rz - 2 * slope * nz) * vz) / distance
             specular += strength * scene.speculars[material] * max(mirrored, 0.0) ** 24
@@ -361,7 +361,7 @@ def _texel(
     uz: float,
     detail: float,
 ) -> tuple[float, float, float]:
-    """The material's color at a point of the unit frame, bilinear in the mipmap level floor(detail)."""
+    """The material's colour at a point of the unit frame, bilinear in the mipmap level floor(detail)."""
     lx, ly, lz = ux * scene.halves[solid, 0], uy * scene.halves[solid, 1], uz * scene.halves[solid, 2]
     a, b = (lz, ly) if face < 2 else ((lx, lz) if face < 4 else (lx, ly))
     u = scene.uv[material, 0, 0] * a + scene.uv[material, 0, 1] * b + scene.uv[material, 0, 2]
@@ -400,24 +400,24 @@ def _texel(
     red, green, blue = red / 255, green / 255, blue / 255
     return (
         max(
-            scene.colors[material, 0, 0] * red
-            + scene.colors[material, 0, 1] * green
-            + scene.colors[material, 0, 2] * blue
-            + scene.colors[material, 0, 3],
+            scene.colours[material, 0, 0] * red
+            + scene.colours[material, 0, 1] * green
+            + scene.colours[material, 0, 2] * blue
+            + scene.colours[material, 0, 3],
             0.0,
         ),
         max(
-            scene.colors[material, 1, 0] * red
-            + scene.colors[material, 1, 1] * green
-            + scene.colors[material, 1, 2] * blue
-            + scene.colors[material, 1, 3],
+            scene.colours[material, 1, 0] * red
+            + scene.colours[material, 1, 1] * green
+            + scene.colours[material, 1, 2] * blue
+            + scene.colours[material, 1, 3],
             0.0,
         ),
         max(
-            scene.colors[material, 2, 0] * red
-            + scene.colors[material, 2, 1] * green
-            + scene.colors[material, 2, 2] * blue
-            + scene.colors[material, 2, 3],
+            scene.colours[material, 2, 0] * red
+            + scene.colours[material, 2, 1] * green
+            + scene.colours[material, 2, 2] * blue
+            + scene.colours[material, 2, 3],
             0.0,
         ),
     )

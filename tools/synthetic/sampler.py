@@ -122,7 +122,7 @@ def generate_sample(
 def render(
     scene: Scene, textures: Textures, pose: np.ndarray, intrinsics: np.ndarray, height: int, width: int, samples: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Color [height, width, 3], in which 1 is white and values may be larger, and z-depth [height, width], float32.
+    """Colour [height, width, 3], in which 1 is white and values may be larger, and z-depth [height, width], float32.
 
     pose: camera-to-world, OpenCV axes, [4, 4]. intrinsics: normalised, [3, 3]. samples: rays per pixel (0: the image is
     black). Depth is that at the pixel's centre.
@@ -206,7 +206,7 @@ def _sample_poses(
             best, best_score = poses, score
         if score > MIN_OVERLAP:
             break
-    if best_score == 0.0:  # all blocked: a row of cameras, close together, at the center of the bounds
+    if best_score == 0.0:  # all blocked: a row of cameras, close together, at the centre of the bounds
         first = look_at(layout.eye_bounds.mean(axis=0), layout.focus_bounds[1])
         best = np.stack([first] * (context + targets))
         best[:, :3, 3] += 0.01 * np.arange(context + targets)[:, None] * first[:3, 0]

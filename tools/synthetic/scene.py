@@ -9,7 +9,7 @@ class Scene(NamedTuple):
     """Solids, materials and lights, in metres; y points down. Solid 0 encloses all others and the cameras.
 
     A material's texture coordinates are `uv @ (a, b, 1)` for the two local coordinates (a, b) of a face, in periods of
-    the texture; its color is `color @ (r, g, b, 1)` for a texel (r, g, b).
+    the texture; its colour is `colour @ (r, g, b, 1)` for a texel (r, g, b).
     """
 
     shapes: np.ndarray  # [solids] int64: BOX, ELLIPSOID or CYLINDER
@@ -19,12 +19,12 @@ class Scene(NamedTuple):
     materials: np.ndarray  # [solids, 6] int64, of the faces -x, +x, -y, +y, -z, +z
     textures: np.ndarray  # [materials] int64, index of a texture
     uv: np.ndarray  # [materials, 2, 3]
-    colors: np.ndarray  # [materials, 3, 4]
+    colours: np.ndarray  # [materials, 3, 4]
     frequencies: np.ndarray  # [materials], periods of the texture per metre
     speculars: np.ndarray  # [materials], strength of the specular highlight
     emissions: np.ndarray  # [materials], emitted light
     light_positions: np.ndarray  # [lights, 3]
-    light_colors: np.ndarray  # [lights, 3]
+    light_colours: np.ndarray  # [lights, 3]
     light_reaches: np.ndarray  # [lights], distance at which intensity is halved
     light_lengths: np.ndarray  # [lights], half length of the linear lamp, for soft shadows; negative: no shadows
     ambient: np.ndarray  # [3]

@@ -9,7 +9,7 @@ import numpy as np
 
 SIZE = 256  # texels along one period at the finest level
 LEVELS = 7  # mipmap levels: 256, 128, ... 4 texels
-# The kind of textures that are crops of photographs (`photo_textures`).
+# The kind of textures that are crops of images (`photo_textures`).
 PHOTO_KIND = "photo"
 
 
@@ -38,9 +38,9 @@ def texture_bank(seed: int, count: int) -> Textures:
     return Textures(np.stack(texels), kinds)
 
 
-def mip_levels(colors: np.ndarray) -> np.ndarray:
-    """All mipmap levels of `colors` [SIZE, SIZE, 3], concatenated, uint8 [texels, 3]."""
-    levels = [colors.clip(0, 1).astype(np.float32)]
+def mip_levels(colours: np.ndarray) -> np.ndarray:
+    """All mipmap levels of `colours` [SIZE, SIZE, 3], concatenated, uint8 [texels, 3]."""
+    levels = [colours.clip(0, 1).astype(np.float32)]
     for _ in range(LEVELS - 1):
         half = levels[-1].shape[0] // 2
         levels.append(np.asarray(cv2.resize(levels[-1], (half, half), interpolation=cv2.INTER_AREA), np.float32))
@@ -57,7 +57,7 @@ def _palette(rng: np.random.Generator, count: int | np.integer) -> np.ndarray:
 
 
 def _interpolate_palette(values: np.ndarray, palette: np.ndarray) -> np.ndarray:
-    """`values` in [0, 1] as colors, interpolated linearly in `palette` [colors, 3]."""
+    """`values` in [0, 1] as colours, interpolated linearly in `palette` [colours, 3]."""
     stops = np.linspace(0, 1, len(palette))
     return np.stack([np.interp(values, stops, palette[:, channel]) for channel in range(3)], axis=-1)
 
@@ -80,10 +80,10 @@ def _to_unit_range(noise: np.ndarray) -> np.ndarray:
     return (0.5 + 0.2 * noise).clip(0, 1)
 
 
-def _add_grain(rng: np.random.Generator, colors: np.ndarray) -> np.ndarray:
-    """`colors` with fractal noise in brightness."""
+def _add_grain(rng: np.random.Generator, colours: np.ndarray) -> np.ndarray:
+    """`colours` with fractal noise in brightness."""
     grain = rng.uniform(0.01, 0.08) * _fractal(rng, rng.uniform(0.2, 1.4))
-    return colors * (1 + grain[..., None])
+    return colours * (1 + grain[..., None])
 
 
 def _grid() -> tuple[np.ndarray, np.ndarray]:
@@ -103,9 +103,9 @@ def _noise(rng: np.random.Generator) -> np.ndarray:
 
 def _plain(rng: np.random.Generator) -> np.ndarray:
     """A painted wall or a sheet of paper: almost no texture."""
-    color = _palette(rng, 1)[0] * 0.5 + rng.uniform(0.25, 0.5)
+    colour = _palette(rng, 1)[0] * 0.5 + rng.uniform(0.25, 0.5)
     values = rng.uniform(0.002, 0.02) * _fractal(rng, 0.2) + rng.uniform(0.0, 0.025) * _fractal(rng, 1.5)
-    return color + values[..., None] * np.ones(3)
+    return colour + values[..., None] * np.ones(3)
 
 
 def _brick(rng: np.random.Generator) -> np.ndarray:
@@ -118,8 +118,8 @@ def _brick(rng: np.random.Generator) -> np.ndarray:
     wobble = 0.015 * _fractal(rng, 1.2)
     edge_x = np.abs((shifted + wobble) % 1 - 0.5) > 0.5 - rng.uniform(0.01, 0.05)
     edge_y = np.abs((y * rows + wobble) % 1 - 0.5) > 0.5 - rng.uniform(0.02, 0.1)
-    colors = _interpolate_palette(shades * rng.uniform(0.3, 1.0), _palette(rng, 3))
-    return _add_grain(rng, np.where((edge_x | edge_y)[..., None], _palette(rng, 1)[0], colors))
+    colours = _interpolate_palette(shades * rng.uniform(0.3, 1.0), _palette(rng, 3))
+    return _add_grain(rng, np.where((edge_x | edge_y)[..., None], _palette(rng, 1)[0], colours))
 
 
 def _checker(rng: np.random.Generator) -> np.ndarray:
@@ -151,8 +151,8 @@ def _stripes(rng: np.random.Generator) -> np.ndarray:
     palette = _palette(rng, len(edges) + 1)
     palette[-1] = palette[0]  # the first and last stripe meet where the texture repeats
     band = np.searchsorted(edges, np.arange(SIZE) / SIZE)
-    colors = np.broadcast_to(palette[band][None], (SIZE, SIZE, 3))
-    return _add_grain(rng, colors if rng.random() < 0.6 else colors.transpose(1, 0, 2))
+    colours = np.broadcast_to(palette[band][None], (SIZE, SIZE, 3))
+    return _add_grain(rng, colours if rng.random() < 0.6 else colours.transpose(1, 0, 2))
 
 
 def _speckle(rng: np.random.Generator) -> np.ndarray:
@@ -163,14 +163,14 @@ def _speckle(rng: np.random.Generator) -> np.ndarray:
     for _ in range(rng.integers(60, 400)):
         radius = min(int(rng.pareto(2.0) * 2 + 1), 30)
         x, y = rng.integers(0, SIZE, 2).tolist()
-        color = palette[rng.integers(1, 6)].tolist()
+        colour = palette[rng.integers(1, 6)].tolist()
         for dx, dy in _tiled_positions(x, y, radius):
-            cv2.circle(canvas, (dx, dy), radius, color, -1)
+            cv2.circle(canvas, (dx, dy), radius, colour, -1)
     return _add_grain(rng, canvas)
 
 
 def _tiled_positions(x: int, y: int, reach: int) -> list[tuple[int, int]]:
-    """All positions at which a mark of radius `reach` at (x, y) is drawn for the texture to tile."""
+    """All positions at which a mark of radius `reach` at (x, y) is placed for the texture to tile."""
     places = [(x + SIZE * i, y + SIZE * j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
     return [(u, v) for u, v in places if -reach <= u < SIZE + reach and -reach <= v < SIZE + reach]
 
@@ -213,8 +213,10 @@ def _cells(rng: np.random.Generator) -> np.ndarray:
     inner = slice(SIZE, 2 * SIZE)
     shades = rng.random(count)[point_of_label[label[inner, inner]]]
     hollow = distance[inner, inner] * np.sqrt(count) / SIZE
-    colors = _interpolate_palette(shades, _palette(rng, 4)) * (1 - rng.uniform(0.2, 0.9) * hollow[..., None].clip(0, 1))
-    return _add_grain(rng, colors)
+    colours = _interpolate_palette(shades, _palette(rng, 4)) * (
+        1 - rng.uniform(0.2, 0.9) * hollow[..., None].clip(0, 1)
+    )
+    return _add_grain(rng, colours)
 
 
 def _weave(rng: np.random.Generator) -> np.ndarray:
@@ -238,23 +240,23 @@ def _strokes(rng: np.random.Generator) -> np.ndarray:
         x, y = rng.integers(0, SIZE, 2).tolist()
         angle = rng.normal(heading, spread)
         dx, dy = int(length * np.cos(angle)), int(length * np.sin(angle))
-        color = (palette[rng.integers(5)] * rng.uniform(0.6, 1.2)).tolist()
+        colour = (palette[rng.integers(5)] * rng.uniform(0.6, 1.2)).tolist()
         for column, row in _tiled_positions(x, y, 31):
-            cv2.line(canvas, (column, row), (column + dx, row + dy), color, thickness)
+            cv2.line(canvas, (column, row), (column + dx, row + dy), colour, thickness)
     return canvas
 
 
 def _collage(rng: np.random.Generator) -> np.ndarray:
     """A poster: a few large shapes on fractal noise."""
     canvas = _noise(rng).astype(np.float32)
-    for color in _palette(rng, rng.integers(6, 20)).tolist():
+    for colour in _palette(rng, rng.integers(6, 20)).tolist():
         centre = rng.integers(0, SIZE, 2)
         if rng.random() < 0.5:
             corners = centre + rng.normal(0, 45, (int(rng.integers(3, 6)), 2))
-            cv2.fillPoly(canvas, [corners.astype(np.int32)], color)
+            cv2.fillPoly(canvas, [corners.astype(np.int32)], colour)
         else:
             axes = (int(rng.integers(5, 50)), int(rng.integers(5, 50)))
-            cv2.ellipse(canvas, (int(centre[0]), int(centre[1])), axes, rng.uniform(0, 180), 0, 360, color, -1)
+            cv2.ellipse(canvas, (int(centre[0]), int(centre[1])), axes, rng.uniform(0, 180), 0, 360, colour, -1)
     return _add_grain(rng, canvas)
 
 

@@ -12,11 +12,13 @@ from ...runtime.cli.options import Config, Overwrite, Quiet, Verbose
 from ...runtime.cli.outputs import command
 from ...runtime.cli.terminal import run, say, warn
 from ...runtime.errors import InputError
+from ...runtime.images.sizes import parse_size
 from ...runtime.system.outputs import outputs
 from .options import Objective, Part, PerceptualKind, Precision
 from .run_files import CHECKPOINT, CURVES, LOG, PREDICTIONS
 
 SECONDS_PER_MINUTE = 60
+MIN_SIDE = 64
 # What the progress bar shows of a step, by its name in the log.
 SHOWN = {"loss": "loss", "abs_rel": "AbsRel", "psnr": "PSNR"}
 
@@ -29,7 +31,7 @@ def train(
     data: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Folder with photographs and transforms.json, instead of synthetic scenes. Every eighth image is held "
+            help="Folder with images and transforms.json, instead of synthetic scenes. Every eighth image is held "
             "out for validation. Can be repeated."
         ),
     ] = None,
@@ -58,7 +60,9 @@ def train(
     ] = True,
     steps: Annotated[int, typer.Option(help="Steps of the whole run.", min=1)] = 20000,
     batch: Annotated[int, typer.Option(help="Scenes per step.", min=1)] = 2,
-    size: Annotated[int, typer.Option(help="Side of the images in the last phase, in pixels.", min=64)] = 256,
+    size: Annotated[
+        str, typer.Option(help="HEIGHTxWIDTH of the images in the last phase, square; or one side.")
+    ] = "256x256",
     lr: Annotated[float, typer.Option(help="Highest learning rate.", min=0)] = 1e-3,
     vit_lr: Annotated[float, typer.Option(help="Highest learning rate of the ViT.", min=0)] = 5e-4,
     seed: Annotated[int, typer.Option(help="Random seed of weights and scenes.", min=0)] = 0,
@@ -92,7 +96,7 @@ def train(
         curriculum=curriculum and not head,
         steps=steps,
         batch=batch,
-        size=size,
+        size=_side(size),
         lr=lr,
         vit_lr=vit_lr,
         seed=seed,
@@ -136,6 +140,14 @@ def train(
         f"{out / CHECKPOINT}: the trained network, for idesplat export; {out / LOG}: loss and metrics of every step",
         f"{out / CURVES}: curves; {out / PREDICTIONS}: image, truth, prediction and error of validation scenes",
     )
+
+
+def _side(text: str) -> int:
+    """The option --size, `256x256` or `256`, as the side in pixels; raises InputError."""
+    height, width = parse_size(f"{text}x{text}" if text.isdecimal() else text)
+    if height != width or height < MIN_SIDE:
+        raise InputError(f"--size {text}: expected a square with sides of {MIN_SIDE} pixels at least, such as 256x256")
+    return height
 
 
 @contextmanager

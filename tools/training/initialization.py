@@ -94,15 +94,15 @@ def _set_smoothing(regulariser: CostRegulariser, first: int) -> None:
     channels, candidates = unet.conv_in.weight.shape[0], regulariser.conv_out.weight.shape[0] // block
     triangles = _triangles(channels // block, candidates)
     pixels = torch.eye(block)
-    _set_center(regulariser.conv_in, torch.kron(triangles / triangles.sum(1, keepdim=True), pixels), first * block)
-    _set_center(unet.conv_in, torch.eye(channels), 0)
+    _set_centre(regulariser.conv_in, torch.kron(triangles / triangles.sum(1, keepdim=True), pixels), first * block)
+    _set_centre(unet.conv_in, torch.eye(channels), 0)
     # The last block's shortcut reads the upsampled map, then the skip connection, which is passed on.
     last_block = unet.up_blocks[-1]
     assert isinstance(last_block, ResBlock) and isinstance(last_block.shortcut, nn.Conv2d)
-    _set_center(last_block.shortcut, torch.eye(channels), channels)
+    _set_centre(last_block.shortcut, torch.eye(channels), channels)
     nn.init.zeros_(last_block.conv2.weight)
-    _set_center(unet.conv_out, torch.eye(channels), 0)
-    _set_center(
+    _set_centre(unet.conv_out, torch.eye(channels), 0)
+    _set_centre(
         regulariser.conv_out, torch.kron((TEMPERATURE * triangles / triangles.sum(0)).T.contiguous(), pixels), 0
     )
 
@@ -114,8 +114,8 @@ def _triangles(channels: int, candidates: int) -> Tensor:
     return (1 - (torch.arange(candidates) - centres[:, None]).abs() / width).clamp(min=0)
 
 
-def _set_center(convolution: nn.Conv2d, matrix: Tensor, first: int) -> None:
-    """Add `matrix` to the kernel's center for the input channels from `first` on, and damp the random weights."""
+def _set_centre(convolution: nn.Conv2d, matrix: Tensor, first: int) -> None:
+    """Add `matrix` to the kernel's centre for the input channels from `first` on, and damp the random weights."""
     convolution.weight.mul_(NOISE)
     middle = convolution.weight.shape[2] // 2
     convolution.weight[:, first : first + matrix.shape[1], middle, middle] += matrix

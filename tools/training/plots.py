@@ -14,9 +14,9 @@ from ...runtime.system.files import atomic_write
 PLOT_WIDTH, PLOT_HEIGHT, DPI = 9.0, 3.6, 100
 # Window of the running mean over a curve, as a share of its points.
 SMOOTHING = 0.02
-# The relative error that is shown with the brightest color.
+# The relative error that is shown with the brightest colour.
 MAX_ERROR = 0.3
-# Percentiles of inverse depth that get the ends of the color map.
+# Percentiles of inverse depth that get the ends of the colour map.
 DEPTH_QUANTILES = 0.01, 0.99
 
 
@@ -54,7 +54,7 @@ def running_mean(values: np.ndarray) -> np.ndarray:
 
 
 def compare_depth(image: np.ndarray, truth: np.ndarray | None, predicted: np.ndarray) -> np.ndarray:
-    """Image, true and predicted inverse depth in the same colors, and relative error, [H, 4 * W, 3] uint8 BGR.
+    """Image, true and predicted inverse depth in the same colours, and relative error, [H, 4 * W, 3] uint8 BGR.
 
     image: RGB in [0, 1], [3, H, W]. truth, predicted: inverse depth, [H, W]; without truth only the prediction follows.
     """
@@ -74,7 +74,7 @@ def to_bgr(image: np.ndarray) -> np.ndarray:
 
 
 def colormap(values: np.ndarray, map_: int) -> np.ndarray:
-    """Values in [0, 1], [H, W], clipped -> uint8 BGR [H, W, 3]. map_: one of OpenCV's color maps."""
+    """Values in [0, 1], [H, W], clipped -> uint8 BGR [H, W, 3]. map_: one of OpenCV's colour maps."""
     return cv2.applyColorMap((values.clip(0, 1) * 255).astype(np.uint8), map_)
 
 

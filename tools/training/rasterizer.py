@@ -44,7 +44,7 @@ def rasterize(
     means: world units, [gaussians, 3]. quats: wxyz, of any length but zero, [gaussians, 4]. scales: world units,
     [gaussians, 3]. opacities: in [0, 1], [gaussians]. sh: degree 0 to 3, [gaussians, (degree + 1)^2, 3].
     viewmat: world-to-camera, OpenCV axes, [4, 4]. K: pixels, pixel centres at .5, [3, 3]. background: [3].
-    depth: sum of z-depth with the weights of color, not divided by alpha. All tensors have one float type, on the CPU.
+    depth: sum of z-depth with the weights of colour, not divided by alpha. All tensors have one float type, on the CPU.
     """
     camera_means = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     seen = torch.nonzero(camera_means.detach()[:, 2] > NEAR)[:, 0]
@@ -52,8 +52,8 @@ def rasterize(
         camera_means, means, quats = camera_means[seen], means[seen], quats[seen]
         scales, opacities, sh = scales[seen], opacities[seen], sh[seen]
     centres, conics = _project(camera_means, quats, scales, viewmat, K, width, height)
-    colors = _colors(sh, means, -viewmat[:3, :3].T @ viewmat[:3, 3])
-    values = torch.cat([colors, camera_means[:, 2:]], dim=-1)  # [gaussians, 4]
+    colours = _colours(sh, means, -viewmat[:3, :3].T @ viewmat[:3, 3])
+    values = torch.cat([colours, camera_means[:, 2:]], dim=-1)  # [gaussians, 4]
     image, transmittance = _Composite.apply(centres, conics, opacities, values, width, height)
     return image[..., :3] + transmittance[..., None] * background, 1 - transmittance, image[..., 3]
 
@@ -93,8 +93,8 @@ def _scaled_axes(quats: Tensor, scales: Tensor) -> Tensor:
     return quaternions_to_matrices(quats) * scales[:, None, :]
 
 
-def _colors(sh: Tensor, means: Tensor, camera: Tensor) -> Tensor:
-    """Color of the Gaussians seen from the camera centre [3], [gaussians, 3]."""
+def _colours(sh: Tensor, means: Tensor, camera: Tensor) -> Tensor:
+    """Colour of the Gaussians seen from the camera centre [3], [gaussians, 3]."""
     count = sh.shape[1]
     if count == 1:
         return torch.clamp_min(SH_0 * sh[:, 0] + 0.5, 0)
@@ -109,7 +109,7 @@ class _Composite(torch.autograd.Function):
     def forward(
         ctx: Any, centres: Tensor, conics: Tensor, opacities: Tensor, values: Tensor, width: int, height: int
     ) -> tuple[Tensor, Tensor]:
-        """centres [splats, 2], conics [splats, 3], opacities [splats], values [splats, 4]: color and z-depth."""
+        """centres [splats, 2], conics [splats, 3], opacities [splats], values [splats, 4]: colour and z-depth."""
         parts = (centres, conics, opacities, values)
         xy, q, o, v = (np.ascontiguousarray(part.detach().numpy()) for part in parts)
         order = np.argsort(v[:, 3], kind="stable")

@@ -19,7 +19,7 @@ from .perceptual import Perceptual
 from .rasterizer import rasterize
 from .schedule import Phase
 
-# Squared errors of colors are small beside errors of depth in candidate spacings.
+# Squared errors of colours are small beside errors of depth in candidate spacings.
 PHOTOMETRIC_WEIGHT = 10.0
 # The metric `within` is the share of pixels whose depth has a smaller relative error.
 WITHIN = 0.05

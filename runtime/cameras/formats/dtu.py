@@ -29,7 +29,7 @@ from ..source import CameraSource
 DESCRIPTION = "MVSNet's *_cam.txt"
 ENDINGS = ("_cam.txt", "cam.txt")
 IMAGE_FOLDERS = (".", "..", "../images", "../blended_images", "../image")
-DTU_PICTURE = re.compile(r"rect_(\d+)_")  # numbered from 1, the camera files from 0
+DTU_IMAGE = re.compile(r"rect_(\d+)_")  # numbered from 1, the camera files from 0
 QUARTER_SCALE = 4  # image size over the size that K in MVSNet's training set is for
 DEFAULT_PLANES = 192
 CENTRE_RANGE = (0.4, 0.6)  # of plausible principal points, in image widths and heights
@@ -110,7 +110,7 @@ def _image(name: str, candidates: Sequence[Path]) -> Path | None:
             return candidate
     if name.isdecimal():
         for candidate in candidates:
-            numbered = DTU_PICTURE.match(candidate.name)
+            numbered = DTU_IMAGE.match(candidate.name)
             if numbered and int(numbered[1]) == int(name) + 1:
                 return candidate
     return None

@@ -12,7 +12,7 @@ from idesplat.export.example_inputs import example_inputs
 from idesplat.runtime.inference.metadata import INPUTS, OUTPUTS
 from onnx import TensorProto
 
-# What is not to lose precision: the geometry, monocular depth, the sparse products, the focused module and the last
+# Kept in float32: the geometry, monocular depth, gather attention, the focus module and the last
 # convolution before the Gaussians.
 EXACT = re.compile(
     r"/(gathered_dot|gathered_weighted_sum)/|/gaussians/(adapter|focus|head2|expand|fuse)|/encoder/(disparity|fusions|laterals)"
@@ -50,8 +50,8 @@ def test_only_quantizable_layers_are_converted(lowered):
     if precision == "int8":
         low = [node for node in graph.node if node.op_type in ("MatMulInteger", "QuantizeLinear")]
         assert {"MatMulInteger", "QuantizeLinear"} <= {node.op_type for node in low}
-        products = [node for node in graph.node if node.op_type == "MatMulInteger"]
-        assert all(node.name.startswith(("/encoder/vit/blocks.", "/encoder/transformer/")) for node in products)
+        matmuls = [node for node in graph.node if node.op_type == "MatMulInteger"]
+        assert all(node.name.startswith(("/encoder/vit/blocks.", "/encoder/transformer/")) for node in matmuls)
         # Borders are repeated as integers: in float32, as ONNX Runtime arranges it, that took 40 times as long.
         (pad,) = (node for node in graph.node if node.name == "/gaussians/head1/Pad")
         around = [node.op_type for node in graph.node if {*node.output, *node.input} & {pad.input[0], pad.output[0]}]

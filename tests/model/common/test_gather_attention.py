@@ -34,12 +34,12 @@ def test_values_and_gradients_are_the_networks_own() -> None:
 def test_exported_values_are_the_networks_own() -> None:
     rng = np.random.default_rng(0)
 
-    def drawn(pairs: int, pixels: int) -> tuple[np.ndarray, ...]:
+    def random_inputs(pairs: int, pixels: int) -> tuple[np.ndarray, ...]:
         rows = rng.integers(0, 2 * pixels, (pairs, CANDIDATES, pixels), np.int32)
         queries = rng.standard_normal((pairs, pixels, CHANNELS), np.float32)
         return queries, rng.standard_normal((2 * pixels, CHANNELS), np.float32), rows
 
-    model = exported(BLOCK, drawn(2, 4 * BLOCK), in_chunks=True)
+    model = exported(BLOCK, random_inputs(2, 4 * BLOCK), in_chunks=True)
     onnx.checker.check_model(model, full_check=True)
     assert [node.op_type for node in model.graph.node].count("Loop") == 2
     assert {node.domain for node in model.graph.node} == {""}
@@ -49,7 +49,7 @@ def test_exported_values_are_the_networks_own() -> None:
     assert all("table" in names_read(node) and "table" not in node.input for node in loops)
     session = onnxruntime.InferenceSession(model.SerializeToString())
     for pairs, blocks in ((2, 4), (3, 10)):  # another number of both
-        arrays = drawn(pairs, blocks * BLOCK)
+        arrays = random_inputs(pairs, blocks * BLOCK)
         expected = Both(BLOCK)(*(torch.from_numpy(array) for array in arrays))
         found = session.run(None, dict(zip(INPUTS, arrays, strict=True)))[0]
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
@@ -66,6 +66,6 @@ def test_the_networks_own_are_put_back() -> None:
 
 
 def test_few_numbers_are_gathered_at_once() -> None:
-    products = GatherAttention(FEW - 1, BLOCK)
-    with chunked(products):
-        assert products.gathered_dot is gathered.gathered_dot
+    attention = GatherAttention(FEW - 1, BLOCK)
+    with chunked(attention):
+        assert attention.gathered_dot is gathered.gathered_dot

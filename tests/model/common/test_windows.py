@@ -23,10 +23,10 @@ def test_attention_within_regions_is_masked_attention(splits, rows, columns, chu
     assert (found - attention(q, k, v)).abs().max() > 0.1  # the mask matters
 
 
-def test_regions_hold_every_token_once_and_nine_sixteenths_of_the_products():
+def test_regions_hold_every_token_once_and_nine_sixteenths_of_the_scores():
     regions = Regions(2, 4, 6)
     windows = torch.arange(2 * 4 * 24 * 3.0).reshape(2, 4, 24, 3)
     groups = regions.split(windows)
     assert torch.equal(regions.join(groups), windows)
-    products = sum(group.shape[0] * group.shape[1] ** 2 for group in groups)
-    assert products == 2 * 4 * 24**2 * 9 / 16
+    scores = sum(group.shape[0] * group.shape[1] ** 2 for group in groups)
+    assert scores == 2 * 4 * 24**2 * 9 / 16

@@ -1,7 +1,7 @@
 """DepthSplat beyond two views: against the release at other numbers of views and strides, and as a small network.
 
 `data/depthsplat-views` was computed by the release (commit 2dad25a) with a ViT of four blocks and random weights, each
-drawn from a seed and the name that the parameter had then (`former_name`). It keeps every third pixel of depth and
+sampled from a seed and the name that the parameter had then (`former_name`). It keeps every third pixel of depth and
 matching features, every twelfth of the upsampled features.
 """
 
@@ -44,8 +44,8 @@ def views(request):
     model = build(replace(config, vit=replace(config.vit, depth=4, out_indices=(0, 1, 2, 3)))).eval()
     seed, gain = expected["seed"].item(), expected["gain"].item()
     shapes = {name: tuple(value.shape) for name, value in model.state_dict().items()}
-    drawn = {name: random_tensor(former_name(name), shape, seed, gain) for name, shape in shapes.items()}
-    model.load_state_dict({name: torch.from_numpy(value.astype(np.float32)) for name, value in drawn.items()})
+    weights = {name: random_tensor(former_name(name), shape, seed, gain) for name, shape in shapes.items()}
+    model.load_state_dict({name: torch.from_numpy(value.astype(np.float32)) for name, value in weights.items()})
     images = resize(expected["thumbnails"] / 255, *map(int, size.split("x")))
     cameras = [expected[name] for name in INPUTS[1:]]
     with torch.no_grad():

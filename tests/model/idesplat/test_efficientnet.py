@@ -1,4 +1,4 @@
-"""Photographic features: the published network's numbers, and a network that has them in place of a ViT."""
+"""EfficientNet features: the published network's numbers, and a network that has them in place of a ViT."""
 
 from pathlib import Path
 

@@ -1,10 +1,10 @@
 """IDESplat against what the released encoder computed, stage by stage.
 
 Whether a projection lands on one pixel or its neighbour is decided by rounding, and with random weights one other pixel
-moves everything behind it: the released program itself, run on another processor, has 83 % of its depths within 1e-3 of
-these references, and pictures moved by one unit in the last place give 98 % of our own (docs/parity.md). So each stage
+moves everything behind it: the released program itself, run on another CPU, has 83 % of its depths within 1e-3 of
+these references, and images moved by one unit in the last place give 98 % of our own (docs/parity.md). So each stage
 starts here from the reference's inverse depth (which the cases hold in full), and what is left is the rounding within
-one stage. The bounds of the units and Gaussians are what that rounding needs; a wrong constant or order departs by
+one stage. The bounds of the units and Gaussians are what that rounding needs; a wrong constant or order deviates by
 whole deviations.
 """
 

@@ -175,9 +175,9 @@ def test_re10k(tmp_path):
     assert detect_format(tmp_path / "0000cc6d8b108390.txt") is CameraFormat.RE10K
     with pytest.raises(InputError, match=r"no image is named by one of its 3 timestamps.*--images"):
         read_cameras(tmp_path / "0000cc6d8b108390.txt")
-    pictures = save_images(tmp_path / "frames", ["52586000.png", "52619000.png"])
-    assert_same(read_cameras(tmp_path / "0000cc6d8b108390.txt", pictures), cameras)
-    assert_same(read_cameras(tmp_path / "0000cc6d8b108390.txt", pictures, CameraFormat.RE10K), cameras)
+    paths = save_images(tmp_path / "frames", ["52586000.png", "52619000.png"])
+    assert_same(read_cameras(tmp_path / "0000cc6d8b108390.txt", paths), cameras)
+    assert_same(read_cameras(tmp_path / "0000cc6d8b108390.txt", paths, CameraFormat.RE10K), cameras)
 
 
 # ---- LLFF
@@ -188,14 +188,14 @@ def test_llff(tmp_path):
     np.save(tmp_path / "poses_bounds.npy", as_llff(cameras))
     assert detect_format(tmp_path / "poses_bounds.npy") is CameraFormat.LLFF
     assert [camera.name for camera in read_cameras(tmp_path)] == ["000", "001"]
-    pictures = save_images(tmp_path / "images", ["IMG_2.png", "IMG_10.png"])
-    for given in ([], pictures, pictures[:1]):
+    paths = save_images(tmp_path / "images", ["IMG_2.png", "IMG_10.png"])
+    for given in ([], paths, paths[:1]):
         read = read_cameras(tmp_path / "poses_bounds.npy", given)
         assert_same(read, cameras)
         assert read[0].depth_range == (0.75 * 1.5, 1.5 * 20.0)
-    pictures[0].unlink()
+    paths[0].unlink()
     with pytest.raises(InputError, match="holds 2 cameras without names, and 1 images were given"):
-        read_cameras(tmp_path / "poses_bounds.npy", pictures[1:])
+        read_cameras(tmp_path / "poses_bounds.npy", paths[1:])
 
 
 def test_llff_axes():
@@ -232,13 +232,13 @@ def test_cam_txt(tmp_path, depths, expected):
     assert str(refused.value) == f"{empty}: is empty; expected a file of cameras"  # once
 
 
-def test_dtu_counts_pictures_from_one_and_may_give_K_for_a_quarter(tmp_path):
+def test_dtu_counts_images_from_one_and_may_give_K_for_a_quarter(tmp_path):
     cameras = known(["rect_001_3_r5000.png", "rect_004_3_r5000.png"])
-    pictures = save_images(tmp_path / "scan1", [camera.name for camera in cameras])
+    paths = save_images(tmp_path / "scan1", [camera.name for camera in cameras])
     for camera, number in zip(cameras, (0, 3), strict=True):
         quarter = np.diag([0.25, 0.25, 1]) @ K
         (tmp_path / f"{number:08}_cam.txt").write_text(as_cam_txt(camera, quarter, "425 2.5"))
-    assert_same(read_cameras(tmp_path, pictures), cameras)
+    assert_same(read_cameras(tmp_path, paths), cameras)
 
 
 # ---- OpenCV's stereo calibration
@@ -262,8 +262,8 @@ def test_stereo_calibration(tmp_path, suffix, size):
     path = tmp_path / f"stereo{suffix}"
     write_stereo(path, size=size)
     assert detect_format(path) is CameraFormat.OPENCV
-    pictures = save_images(tmp_path / "pair", ["im0.png", "im1.png"])
-    cameras = read_cameras(path, pictures)
+    paths = save_images(tmp_path / "pair", ["im0.png", "im1.png"])
+    cameras = read_cameras(path, paths)
     assert [camera.name for camera in cameras] == ["im0.png", "im1.png"]
     assert_stereo(cameras)
     if size:
@@ -272,7 +272,7 @@ def test_stereo_calibration(tmp_path, suffix, size):
         with pytest.raises(InputError, match="camera 1: has no imageSize"):
             read_cameras(path)
     with pytest.raises(InputError, match="calibrates two cameras, but 1 images are given"):
-        read_cameras(path, pictures[:1])
+        read_cameras(path, paths[:1])
 
 
 @pytest.mark.parametrize("names", [("K{}", "D{}", "R", "T"), ("cameraMatrix{}", "distCoeffs{}", "R", "T")])

@@ -44,8 +44,8 @@ quick = settings(max_examples=60, suppress_health_check=[HealthCheck.function_sc
 
 
 @pytest.fixture(scope="module")
-def pictures(tmp_path_factory):
-    return save_images(tmp_path_factory.mktemp("pictures"), NAMES, 64, 48)
+def image_paths(tmp_path_factory):
+    return save_images(tmp_path_factory.mktemp("images"), NAMES, 64, 48)
 
 
 def small(names=NAMES, matrix=K):
@@ -74,9 +74,9 @@ FILE_NAMES = {
 }
 
 
-def assert_cameras_or_input_error(path, pictures, form):
+def assert_cameras_or_input_error(path, image_paths, form):
     try:
-        cameras = read_cameras(path, pictures, form)
+        cameras = read_cameras(path, image_paths, form)
     except InputError as error:
         assert str(error).startswith(str(path))
         return
@@ -88,7 +88,7 @@ def assert_cameras_or_input_error(path, pictures, form):
 @quick
 @given(data=st.data())
 @pytest.mark.parametrize("form", FILE_NAMES)
-def test_mutated_bytes(tmp_path, pictures, form, data):
+def test_mutated_bytes(tmp_path, image_paths, form, data):
     mutated = bytearray(content(form, tmp_path))
     if data.draw(st.booleans()):
         del mutated[data.draw(st.integers(0, len(mutated))) :]
@@ -97,24 +97,24 @@ def test_mutated_bytes(tmp_path, pictures, form, data):
         mutated[start : start + data.draw(st.integers(0, 8))] = data.draw(st.binary(max_size=8))
     path = tmp_path / FILE_NAMES[form]
     path.write_bytes(mutated)
-    assert_cameras_or_input_error(path, pictures, data.draw(st.sampled_from([form, None])))
+    assert_cameras_or_input_error(path, image_paths, data.draw(st.sampled_from([form, None])))
 
 
 @quick
 @given(data=st.data())
 @pytest.mark.parametrize("form", [CameraFormat.RE10K, CameraFormat.DTU, CameraFormat.OPENCV])
-def test_mutated_words(tmp_path, pictures, form, data):
+def test_mutated_words(tmp_path, image_paths, form, data):
     words = re.split(r"(\s+)", content(form, tmp_path).decode())
     for _ in range(data.draw(st.integers(1, 4))):
         words[data.draw(st.integers(0, len(words) - 1))] = data.draw(st.sampled_from(WORDS))
     path = tmp_path / FILE_NAMES[form]
     path.write_text("".join(words))
-    assert_cameras_or_input_error(path, pictures, data.draw(st.sampled_from([form, None])))
+    assert_cameras_or_input_error(path, image_paths, data.draw(st.sampled_from([form, None])))
 
 
 @quick
 @given(data=st.data())
-def test_mutated_numbers_of_llff(tmp_path, pictures, data):
+def test_mutated_numbers_of_llff(tmp_path, image_paths, data):
     rows = as_llff(small(NAMES, CENTRED))
     for _ in range(data.draw(st.integers(1, 4))):
         rows[data.draw(st.integers(0, 1)), data.draw(st.integers(0, 16))] = data.draw(NUMBERS)
@@ -122,7 +122,7 @@ def test_mutated_numbers_of_llff(tmp_path, pictures, data):
         rows = rows.astype(data.draw(st.sampled_from(["f8", "f4", ">f8", "f2", "c16", "O"])))
     shape = data.draw(st.sampled_from([(2, 17), (17, 2), (34,), (2, 17, 1), (1, 34)]))
     np.save(tmp_path / "poses_bounds.npy", rows.reshape(shape))
-    assert_cameras_or_input_error(tmp_path / "poses_bounds.npy", pictures, None)
+    assert_cameras_or_input_error(tmp_path / "poses_bounds.npy", image_paths, None)
 
 
 # ---- COLMAP's library is in a process of its own, which takes half a second

@@ -25,7 +25,7 @@ from idesplat.tools.synthetic.make_scene import make_scene
 
 @pytest.fixture
 def workplace(scene, exported, tmp_path, monkeypatch):
-    """A folder of one's own with the photographs, their cameras and the model, and we stand in it."""
+    """A folder of one's own with the images, their cameras and the model, and we stand in it."""
     shutil.copytree(scene / "images", tmp_path / "images")
     shutil.copy(scene / "transforms.json", tmp_path)
     shutil.copy(exported[0], tmp_path / "model.onnx")
@@ -83,14 +83,14 @@ def test_everything_it_can_write(workplace, scene, capsys):
 
 
 def test_commands_to_copy_work_in_folders_with_spaces(workplace, capsys):
-    Path("images").rename("my photographs")
+    Path("images").rename("my images")
     Path("transforms.json").rename("my cameras")
-    given = ("--images", "my photographs", "--cameras", "my cameras", "--camera-format", "transforms")
+    given = ("--images", "my images", "--cameras", "my cameras", "--camera-format", "transforms")
     assert run_command(main, *given, "--model", "model.onnx", "--out", "my scene.ply") == 0
     printed = capsys.readouterr().out
     view, render = (shlex.split(line) for line in printed.splitlines() if line.startswith("    "))
     cameras = ["--cameras", "my cameras", "--camera-format", "transforms"]
-    assert view == ["idesplat", "view", "my scene.ply", *cameras, "--images", "my photographs"]
+    assert view == ["idesplat", "view", "my scene.ply", *cameras, "--images", "my images"]
     assert render == ["idesplat", "render", "my scene.ply", *cameras, "--out", "DIR"]
     assert run_command(render_main, *render[2:]) == 0
     assert run_command(view_main, *view[2:], "--html", "page.html") == 0
@@ -119,12 +119,12 @@ def test_staged_folder_and_a_list_of_files(workplace, exported):
     assert len(read_ply(Path("scene.ply"))) == 2 * 64 * 96
 
 
-def test_cleaning_is_counted_and_formats_follow_the_name(workplace, capsys):
-    cleaning = ("--crop-border", "4", "--min-opacity", "0.01", "--merge-duplicates")
-    arguments = (*USUAL[:-1], "scene.spz", "--json", "summary.json", *cleaning)
+def test_filters_are_counted_and_formats_follow_the_name(workplace, capsys):
+    filters = ("--crop-border", "4", "--min-opacity", "0.01", "--merge-duplicates")
+    arguments = (*USUAL[:-1], "scene.spz", "--json", "summary.json", *filters)
     assert run_command(main, *arguments) == 0
     summary = json.loads(Path("summary.json").read_text())
-    left_out = summary["cleaned"]["left_out"]
+    left_out = summary["filtered"]["left_out"]
     assert list(left_out) == ["min_opacity", "crop_border", "merge_duplicates"]
     assert left_out["crop_border"] > 0
     left = len(read_splats(Path("scene.spz")))
@@ -141,16 +141,16 @@ def test_points_and_surfaces_follow_the_name(workplace, capsys):
         assert f"open {name} in MeshLab" in capsys.readouterr().out
 
 
-def test_portrait_photographs_and_another_size(workplace):
+def test_portrait_images_and_another_size(workplace):
     assert run_command(main, *USUAL, "--size", "96x64", "--near", "1", "--far", "20") == 0
     assert len(read_ply(Path("scene.ply"))) == 2 * 96 * 64
 
 
 def test_what_it_writes_can_be_rendered(workplace):
     assert run_command(main, *USUAL) == 0
-    assert run_command(render_main, "scene.ply", "--cameras", "transforms.json", "--out", "drawn") == 0
+    assert run_command(render_main, "scene.ply", "--cameras", "transforms.json", "--out", "renders") == 0
     names = {path.stem for path in Path("images").iterdir()}
-    assert {path.stem for path in Path("drawn").glob("*.png")} == names
+    assert {path.stem for path in Path("renders").glob("*.png")} == names
 
 
 def test_chosen_frames_and_cameras_written(workplace, capsys):
@@ -244,7 +244,7 @@ def test_neither_images_nor_a_name_to_write(workplace, capsys):
     assert "--out: expected the file to write" in capsys.readouterr().err
 
 
-def test_photographs_alone(workplace, tmp_path_factory, capsys):
+def test_images_alone(workplace, tmp_path_factory, capsys):
     folder = tmp_path_factory.mktemp("larger")
     make_scene(folder, seed=2, views=2, height=240, width=320)
     focal = str(read_cameras(folder / "transforms.json")[0].K[0, 0])
@@ -254,7 +254,7 @@ def test_photographs_alone(workplace, tmp_path_factory, capsys):
     assert "cameras of 2 images estimated by OpenCV" in printed and "unit is the median depth" in printed
     assert "the cameras' depth ranges" in printed and "--cameras found.json" in printed
     assert len(read_ply(Path("scene.ply"))) == 2 * 64 * 96
-    assert run_command(render_main, "scene.ply", "--cameras", "found.json", "--out", "drawn") == 0
+    assert run_command(render_main, "scene.ply", "--cameras", "found.json", "--out", "renders") == 0
     assert run_command(main, *given, "--focal", focal) == 0
     printed = capsys.readouterr().out
     assert "wrote scene.cameras.json" in printed and "idesplat view scene.ply --cameras scene.cameras.json" in printed
@@ -296,7 +296,7 @@ def without_fields(content, *names):
 
 BAD = {
     "missing image folder": (nothing, ("--images", "nowhere"), "nowhere"),
-    "unreadable image": (lambda: Path("images/000.png").write_bytes(b"not a picture"), ("--select", "0,1"), "000.png"),
+    "unreadable image": (lambda: Path("images/000.png").write_bytes(b"not an image"), ("--select", "0,1"), "000.png"),
     "empty image": (lambda: Path("images/000.png").write_bytes(b""), ("--select", "0,1"), "000.png"),
     "corrupt JSON": (lambda: Path("transforms.json").write_text('{"frames": ['), (), "transforms.json"),
     "missing cameras": (nothing, ("--cameras", "none.json"), "none.json"),
@@ -313,7 +313,7 @@ BAD = {
     ),
     "zero focal length": (change_cameras(lambda c: c.update(fl_x=0)), (), "focal lengths are 0"),
     "negative focal length": (change_cameras(lambda c: c.update(fl_y=-300)), (), "focal lengths"),
-    "one photograph": (lambda: [path.unlink() for path in sorted(Path("images").iterdir())[1:]], (), "at least 2"),
+    "one image": (lambda: [path.unlink() for path in sorted(Path("images").iterdir())[1:]], (), "at least 2"),
     "two identical cameras": (
         change_cameras(
             lambda c: [frame.update(transform_matrix=c["frames"][0]["transform_matrix"]) for frame in c["frames"]]
@@ -350,7 +350,7 @@ BAD = {
         ("--out", "scene.mesh.ply", "--min-opacity", "0.1"),
         "a surface knows --max-depth-jump alone",
     ),
-    "a border wider than the pictures": (nothing, ("--crop-border", "32"), "--crop-border 32"),
+    "a border wider than the images": (nothing, ("--crop-border", "32"), "--crop-border 32"),
     "an output that is no splat file": (nothing, ("--out", "scene.txt"), ".ply"),
     "an output folder that is a file": (nothing, ("--save-depth", "transforms.json"), "transforms.json"),
 }
@@ -358,10 +358,10 @@ BAD = {
 
 @pytest.mark.parametrize("name", BAD)
 def test_bad_input_is_one_line_and_leaves_nothing(workplace, capfd, name):
-    spoil, arguments, expected = BAD[name]
-    spoil()
+    corrupt, arguments, expected = BAD[name]
+    corrupt()
     with Outputs("idesplat-infer"), atomic_write(Path("scene.ply")) as temporary:
-        temporary.write_bytes(b"the result of yesterday")
+        temporary.write_bytes(b"an earlier result")
     before = {path: path.stat().st_mtime_ns for path in workplace.rglob("*")}
     options = dict(zip(USUAL[::2], USUAL[1::2], strict=True)) | dict(zip(arguments[::2], arguments[1::2], strict=True))
     assert run_command(main, *(part for option in options.items() for part in option)) == 2

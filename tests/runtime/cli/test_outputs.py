@@ -28,7 +28,7 @@ FIRST, SECOND = "000.png", "001.png"
 
 @pytest.fixture
 def dataset(tmp_path, monkeypatch):
-    """A folder with two photographs, their cameras, a scene, and something of the user's; we stand in it."""
+    """A folder with two images, their cameras, a scene, and something of the user's; we stand in it."""
     monkeypatch.chdir(tmp_path)
     Path("images").mkdir()
     rng = np.random.default_rng(0)
@@ -51,7 +51,7 @@ def refused(capfd, folder, main, *arguments):
     return lines[0]
 
 
-# ---- idesplat render: seven ways to say where the photographs are
+# ---- idesplat render: seven ways to say where the images are
 
 
 def as_folder(dataset):
@@ -115,24 +115,24 @@ RENDERS = [
 
 @pytest.mark.parametrize("overwrite", [False, True])
 @pytest.mark.parametrize("way", RENDERS)
-def test_render_never_replaces_photographs(dataset, capfd, way, overwrite):
+def test_render_never_replaces_images(dataset, capfd, way, overwrite):
     if way is as_colmap:
         pytest.importorskip("pycolmap")
     cameras, out = way(dataset)
     if overwrite and way is as_own_json_elsewhere:
-        return  # nothing says where these photographs are, and the user wants to replace them
+        return  # nothing says where these images are, and the user wants to replace them
     options = ["--overwrite"] if overwrite else []
     line = refused(capfd, dataset, render, "scene.ply", "--cameras", cameras, "--out", out, "--depth", *options)
     assert "would replace an image" in line or (not overwrite and "idesplat did not write it" in line)
 
 
-def test_render_never_replaces_a_named_picture(dataset, capfd):
+def test_render_never_replaces_a_named_image(dataset, capfd):
     shutil.copy("images/000.png", "mine.png")
     assert "mine.png: exists" in refused(capfd, dataset, render, "scene.ply", "--out", "mine.png")
 
 
 def test_render_again_and_over(dataset, capfd):
-    """What it drew, it draws again; what was changed since, only if told."""
+    """Its own output is replaced; a file changed since, only with --overwrite."""
     given = ("scene.ply", "--cameras", "transforms.json", "--out", "renders")
     assert run_command(render, *given) == run_command(render, *given) == 0
     Path("renders/001.png").write_bytes(b"touched up by hand")
@@ -143,7 +143,7 @@ def test_render_again_and_over(dataset, capfd):
 
 
 def test_render_beside_its_cameras_again(dataset):
-    """Pictures that it drew itself, where photographs might be, are no photographs."""
+    """Its own renderings in a folder of images do not count as input images."""
     shutil.move("transforms.json", "images/cameras.json")
     given = ("scene.ply", "--cameras", "images/cameras.json", "--out", "images/images")
     write_cameras(Path("images/cameras.json"), pinholes(["000.jpg", "001.jpg"]))
@@ -161,7 +161,7 @@ def workplace(dataset, exported):
 
 USUAL = {"--images": "images", "--cameras": "transforms.json", "--model": "model.onnx", "--out": "new.ply"}
 INFERS = {
-    "depth maps over photographs": (
+    "depth maps over images": (
         {"--save-depth": "images", "--near": "1", "--far": "9"},
         "would replace an image",
     ),
@@ -171,7 +171,7 @@ INFERS = {
     "splats over the model": ({"--model": "model.ply", "--out": "model.ply"}, "would replace the model"),
     "summary over splats": ({"--json": "new.ply"}, "--json new.ply: is also the file of --out"),
     "summary over splats in other letters": ({"--json": "NEW.ply"}, "--json NEW.ply: is also the file of --out"),
-    "report over a photograph": ({"--report": "images/000.png"}, "would replace an image"),
+    "report over an image": ({"--report": "images/000.png"}, "would replace an image"),
     "a file where a folder is to be": ({"--save-depth": "new.ply"}, "--save-depth new.ply"),
     "a folder in a file": ({"--render": "new.ply/views"}, "new.ply is the file of --out"),
 }
@@ -188,7 +188,7 @@ def test_infer_never_replaces_what_it_reads(workplace, capfd, name, overwrite):
 
 @pytest.mark.parametrize("option", [("--save-depth", "images"), ("--report", "images/001.png")])
 @pytest.mark.parametrize("way", [as_names_without_suffix, as_own_json_elsewhere])
-def test_infer_never_replaces_photographs_that_only_the_cameras_name(dataset, capfd, way, option):
+def test_infer_never_replaces_images_that_only_the_cameras_name(dataset, capfd, way, option):
     cameras, _ = way(dataset)
     given = ["--cameras", cameras, "--out", "new.ply", "--near", "1", "--far", "9"]  # the bundled model
     assert "would replace an image" in refused(capfd, dataset, infer, *given, *option, "--overwrite")
@@ -235,7 +235,7 @@ def test_a_scene_is_made_only_over_its_own(tmp_path, capfd):
     assert "transforms.json: exists" in refused(capfd, tmp_path, make_scene, *given)
 
 
-def test_evaluation_leaves_pictures_of_others(dataset, exported, capfd):
+def test_evaluation_leaves_images_of_others(dataset, exported, capfd):
     from idesplat.tools.evaluation.cli import main as evaluate
 
     given = ("scene", "images", "--cameras", "transforms.json", "--model", exported[0])

@@ -1,4 +1,4 @@
-"""Pictures out: the command idesplat render, camera paths and PNG files."""
+"""Images out: the command idesplat render, camera paths and PNG files."""
 
 import json
 import subprocess
@@ -59,7 +59,7 @@ def run(_: pytest.MonkeyPatch, *arguments: object) -> int:
     return run_command(main, *arguments)
 
 
-def test_draws_every_camera_at_its_own_size(
+def test_renders_every_camera_at_its_own_size(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     rng = np.random.default_rng(0)
@@ -76,7 +76,7 @@ def test_draws_every_camera_at_its_own_size(
     ]
     write_ply(tmp_path / "scene.ply", gaussians)
     write_cameras(tmp_path / "cameras.json", views)
-    out = tmp_path / "new" / "pictures"
+    out = tmp_path / "new" / "images"
     status = run(
         monkeypatch,
         tmp_path / "scene.ply",
@@ -103,7 +103,7 @@ def test_draws_every_camera_at_its_own_size(
 
 
 def test_a_transforms_json_worked_by_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An OpenGL camera at (0, 0, 3) looks along -z; what is right of and above its axis is so in the picture."""
+    """An OpenGL camera at (0, 0, 3) looks along -z; what is right of and above its axis is so in the image."""
     write_ply(tmp_path / "scene.ply", one_gaussian((0.5, 0.25, 1), (1, 0, 0)))
     matrix = np.eye(4)
     matrix[2, 3] = 3
@@ -112,11 +112,11 @@ def test_a_transforms_json_worked_by_hand(tmp_path: Path, monkeypatch: pytest.Mo
     (tmp_path / "transforms.json").write_text(json.dumps(camera))
     out = tmp_path / "out"
     assert run(monkeypatch, tmp_path / "scene.ply", "--cameras", tmp_path / "transforms.json", "--out", out) == 0
-    picture = read_rgb(out / "front.png")
-    assert picture.shape == (41, 61, 3)
+    image = read_rgb(out / "front.png")
+    assert image.shape == (41, 61, 3)
     # 0.5 / 2 * 40 = 10 pixels right of the axis, 0.25 / 2 * 40 = 5 above it
-    assert np.unravel_index(picture[..., 0].argmax(), (41, 61)) == (20 - 5, 30 + 10)
-    assert picture[15, 40].tolist() == [round(0.99 * 255), 0, 0]
+    assert np.unravel_index(image[..., 0].argmax(), (41, 61)) == (20 - 5, 30 + 10)
+    assert image[15, 40].tolist() == [round(0.99 * 255), 0, 0]
 
 
 @pytest.mark.parametrize(
@@ -129,7 +129,7 @@ def test_a_transforms_json_worked_by_hand(tmp_path: Path, monkeypatch: pytest.Mo
         (("A.jpg", "a.jpg"), ("0-A", "1-a")),
     ],
 )
-def test_pictures_never_overwrite_each_other(
+def test_images_never_overwrite_each_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, names: tuple[str, ...], written: tuple[str, ...]
 ) -> None:
     write_ply(tmp_path / "scene.ply", one_gaussian((0, 0, 2), (1, 1, 1)))
@@ -180,13 +180,13 @@ def test_importing_the_command_loads_nothing_heavy() -> None:
     subprocess.run([sys.executable, "-c", program], check=True)
 
 
-def test_draw_view_takes_camera_to_world() -> None:
+def test_render_view_takes_camera_to_world() -> None:
     extrinsics = pose((0.3, -0.5, 0.2), (1, 2, 3))
     ahead = extrinsics @ [0.1, -0.2, 2, 1]  # in the camera's own frame 2 ahead, a little right and up
-    drawn = render_view(one_gaussian(tuple(ahead[:3]), (0, 1, 0)), extrinsics, pinhole(101, 81), 101, 81)
+    rendered = render_view(one_gaussian(tuple(ahead[:3]), (0, 1, 0)), extrinsics, pinhole(101, 81), 101, 81)
     # 50.5 + 101 * 0.1 / 2 = 55.55 and 40.5 - 101 * 0.2 / 2 = 30.4 are the pixels 55 and 30
-    assert np.unravel_index(drawn.alpha.argmax(), (81, 101)) == (30, 55)
-    assert drawn.depth[30, 55] / drawn.alpha[30, 55] == pytest.approx(2, abs=1e-5)
+    assert np.unravel_index(rendered.alpha.argmax(), (81, 101)) == (30, 55)
+    assert rendered.depth[30, 55] / rendered.alpha[30, 55] == pytest.approx(2, abs=1e-5)
 
 
 # ---- stills, orbits, paths, videos
@@ -215,8 +215,8 @@ def read_video(path: Path) -> tuple[np.ndarray, float]:
         return np.stack(frames), float(stream.average_rate)
 
 
-def psnr(drawn: np.ndarray, expected: np.ndarray) -> float:
-    return float(-10 * np.log10(np.square(drawn / 255 - np.clip(expected, 0, 1)).mean()))
+def psnr(rendered: np.ndarray, expected: np.ndarray) -> float:
+    return float(-10 * np.log10(np.square(rendered / 255 - np.clip(expected, 0, 1)).mean()))
 
 
 @pytest.mark.parametrize(("height", "width"), [(40, 60), (60, 40)])
@@ -239,7 +239,7 @@ def test_an_orbit_keeps_looking_at_its_pivot() -> None:
     poses = orbit_extrinsics(start, pivot, np.array([0, -2.0, 0]), 360, 8)
     np.testing.assert_allclose(poses[0], start, atol=1e-12)
     seen = [np.linalg.inv(camera)[:3] @ [*pivot, 1] for camera in poses]
-    np.testing.assert_allclose(seen, [seen[0]] * 8, atol=1e-12)  # at the same place of every picture
+    np.testing.assert_allclose(seen, [seen[0]] * 8, atol=1e-12)  # at the same place of every image
     np.testing.assert_allclose(poses[:, 1, 3], 0, atol=1e-12)  # at the same height
     np.testing.assert_allclose((poses[2, :3, 3] - pivot)[[0, 2]], [4, -0.5], atol=1e-12)  # a quarter on: from the right
     np.testing.assert_allclose(poses[:, :3, 3].mean(axis=0), [0.5, 0, 0], atol=1e-12)
@@ -257,9 +257,9 @@ def test_an_orbit_keeps_looking_at_its_pivot() -> None:
 def test_an_orbit_goes_around_what_the_cameras_look_at() -> None:
     ball = a_ball_of_gaussians((0, 0, 0))
     cameras = [Camera(f"{x}", 40, 30, pinhole(40, 30), pose((0, 0, 0), (x, 0, -4))) for x in (-0.1, 0.0, 0.1)]
-    shots = orbit_cameras(ball, cameras, 360, 4)
-    np.testing.assert_allclose(shots[0].extrinsics, cameras[1].extrinsics, atol=1e-12)
-    opposite = shots[2].extrinsics
+    orbit = orbit_cameras(ball, cameras, 360, 4)
+    np.testing.assert_allclose(orbit[0].extrinsics, cameras[1].extrinsics, atol=1e-12)
+    opposite = orbit[2].extrinsics
     np.testing.assert_allclose(opposite[:3, 2], [0, 0, -1], atol=1e-9)
     assert -1 < (opposite[2, 3] - 4) / 2 < 0  # the pivot is on the ball's near side, between -1 and 0
     with pytest.raises(InputError, match="sees nothing of the scene"):
@@ -280,10 +280,10 @@ def test_another_size_shows_what_the_camera_showed() -> None:
 def test_a_still_without_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_ply(tmp_path / "scene.ply", a_ball_of_gaussians())
     assert run(monkeypatch, tmp_path / "scene.ply", "--out", tmp_path / "still.png", "--size", "48x64") == 0
-    picture = read_rgb(tmp_path / "still.png")
+    image = read_rgb(tmp_path / "still.png")
     camera = overview_camera(a_ball_of_gaussians(), 48, 64)
     expected = render_view(a_ball_of_gaussians(), camera.extrinsics, camera.K, 64, 48).rgb
-    assert psnr(picture, expected) > 45
+    assert psnr(image, expected) > 45
     assert {path.name for path in tmp_path.iterdir()} == {"scene.ply", "still.png"}
 
 
@@ -310,28 +310,28 @@ def test_an_orbit_as_a_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ca
     out = tmp_path / "orbit.mp4"
     options = ("--orbit", "--frames", 6, "--fps", 12, "--size", "97x128", "--depth", "--alpha")
     assert run(monkeypatch, tmp_path / "scene.ply", "--out", out, *options) == 0
-    shots = orbit_cameras(ball, [overview_camera(ball, 97, 128)], 360, 6)
+    orbit = orbit_cameras(ball, [overview_camera(ball, 97, 128)], 360, 6)
     films = {name: read_video(tmp_path / f"orbit{name}.mp4") for name in ("", "-depth", "-alpha")}
     assert {path.name for path in tmp_path.iterdir()} == {"scene.ply", *(f"orbit{name}.mp4" for name in films)}
     for frames, fps in films.values():
         assert frames.shape == (6, 98, 128, 3)  # videos have even sides
         assert fps == pytest.approx(12)
-    for index, shot in enumerate(shots):
-        drawn = render_view(ball, shot.extrinsics, shot.K, 128, 97)
-        assert psnr(films[""][0][index][:97], drawn.rgb) > 25
-        assert psnr(films["-alpha"][0][index][:97], np.repeat(drawn.alpha[..., None], 3, axis=2)) > 25
-    assert psnr(films[""][0][3][:97], render_view(ball, shots[0].extrinsics, shots[0].K, 128, 97).rgb) < 25
+    for index, camera in enumerate(orbit):
+        rendered = render_view(ball, camera.extrinsics, camera.K, 128, 97)
+        assert psnr(films[""][0][index][:97], rendered.rgb) > 25
+        assert psnr(films["-alpha"][0][index][:97], np.repeat(rendered.alpha[..., None], 3, axis=2)) > 25
+    assert psnr(films[""][0][3][:97], render_view(ball, orbit[0].extrinsics, orbit[0].K, 128, 97).rgb) < 25
     assert "orbit-depth.mp4" in capsys.readouterr().out
 
 
-def test_many_pictures_are_said_in_one_line(
+def test_many_images_are_reported_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     monkeypatch.chdir(tmp_path)
     write_ply(Path("scene.ply"), a_ball_of_gaussians())
     assert run(monkeypatch, "scene.ply", "--orbit", "--frames", 9, "--depth", "--size", "24x32", "--out", "out") == 0
-    wrote, drawn = capsys.readouterr().out.splitlines()
-    assert wrote == "wrote 27 files in out" and drawn.endswith("rendered in 9 images; open out in any image viewer")
+    wrote, last = capsys.readouterr().out.splitlines()
+    assert wrote == "wrote 27 files in out" and last.endswith("rendered in 9 images; open out in any image viewer")
     assert len(list(Path("out").iterdir())) == 27
 
 
@@ -369,7 +369,7 @@ def test_a_path_through_the_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (("--out", "a.MOV", "--orbit"), "expected a folder, or a file that ends in .png or .mp4"),
     ],
 )
-def test_requests_that_make_no_picture(
+def test_requests_that_make_no_image(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, options: tuple, message: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -382,7 +382,7 @@ def test_requests_that_make_no_picture(
     assert {path.name for path in tmp_path.iterdir()} == {"scene.ply", "cameras.json"}
 
 
-def test_cameras_of_a_picture_too_large_are_refused(
+def test_cameras_of_an_image_too_large_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     write_ply(tmp_path / "scene.ply", a_ball_of_gaussians())
@@ -397,7 +397,7 @@ def test_cameras_of_a_picture_too_large_are_refused(
         assert not (tmp_path / "out").exists()
 
 
-def test_a_depth_picture_never_overwrites_another_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_depth_image_never_overwrites_another_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_ply(tmp_path / "scene.ply", a_ball_of_gaussians())
     cameras = [Camera(name, 20, 30, pinhole(20, 30), pose((0, 0, 0), (1, -2, 0))) for name in ("a.jpg", "a-depth.jpg")]
     write_cameras(tmp_path / "cameras.json", cameras)
@@ -448,12 +448,12 @@ def test_folders_are_made_and_left_only_with_what_they_are_for(
     assert {path.name for path in Path("new").rglob("*.*")} == {"a.png", "a.mp4"}
 
     def fails(*arguments: object) -> None:
-        raise InputError("it cannot be drawn")
+        raise InputError("it cannot be rendered")
 
     monkeypatch.setattr(render, "render_view", fails)
     for out in ("other/one/a.mp4", "other/a.png", "other/folder"):
         assert run(monkeypatch, "scene.ply", "--size", "24x32", "--out", out) == 2
-        assert "it cannot be drawn" in capsys.readouterr().err
+        assert "it cannot be rendered" in capsys.readouterr().err
     assert not Path("other").exists()
 
 
@@ -516,26 +516,26 @@ def test_near_is_warm_and_unknown_is_black(tmp_path: Path) -> None:
     depth = np.repeat(1 / np.linspace(1, 0.1, 101, dtype=np.float32)[None], 20, axis=0)
     depth[0, :3] = 0, np.nan, np.inf
     save_depth_png(tmp_path / "depth.png", depth)
-    picture = read_rgb(tmp_path / "depth.png").astype(int)
-    assert not picture[0, :3].any()
-    red, green, blue = picture[10, 0]
+    image = read_rgb(tmp_path / "depth.png").astype(int)
+    assert not image[0, :3].any()
+    red, green, blue = image[10, 0]
     assert red > green + 50 and red > blue + 50
-    red, green, blue = picture[10, 95]
+    red, green, blue = image[10, 95]
     assert blue > red + 50
     # Colours follow inverse depth: the middle column, though at depth 1.8 of 1 to 10, has the map's middle, green.
-    red, green, blue = picture[10, 50]
+    red, green, blue = image[10, 50]
     assert green > red + 50 and green > blue + 50
 
 
 @pytest.mark.parametrize("value", [0.0, 3.0, np.nan])
 def test_depth_without_range(tmp_path: Path, value: float) -> None:
     save_depth_png(tmp_path / "depth.png", np.full((4, 5), value, np.float32))
-    picture = read_rgb(tmp_path / "depth.png")
-    assert picture.shape == (4, 5, 3)
-    assert picture.any() == (value == 3.0)
+    image = read_rgb(tmp_path / "depth.png")
+    assert image.shape == (4, 5, 3)
+    assert image.any() == (value == 3.0)
 
 
-def test_pictures_that_cannot_be_written(tmp_path: Path) -> None:
+def test_images_that_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "folder.png").mkdir()
     for path in (tmp_path / "none" / "a.png", tmp_path / "folder.png"):
         with pytest.raises(InputError, match="cannot write"):

@@ -1,4 +1,4 @@
-"""The command `idesplat view` in a real browser: the page, and the file to send, show what the rasteriser draws."""
+"""The command `idesplat view` in a real browser: the page, and the file to send, show what the rasteriser renders."""
 
 import subprocess
 import sys
@@ -23,10 +23,10 @@ from idesplat.tools.evaluation.metrics import ssim
 
 WIDTH, HEIGHT = 320, 240
 WHITE = (1.0, 1.0, 1.0)
-PATIENCE = 120  # seconds for a page that a CPU draws
+PATIENCE = 120  # seconds for a page that a CPU renders
 # Structural similarity. The page rounds colours and opacities to 8 bits and ends splats at 2.8 standard deviations.
 SIMILAR = 0.97
-TURNED = 0.9  # at least as different is the same picture the wrong way round
+TURNED = 0.9  # at least as different is the same image the wrong way round
 FREE = 275  # columns of the page in which the other camera is not to be seen
 # viser's own: the corners of its splats have two coordinates, and three.js looks for a third
 KNOWN = "THREE.BufferGeometry.computeBoundingSphere(): Computed radius is NaN."
@@ -40,7 +40,7 @@ def camera() -> Camera:
     pose[:3, :3] = cv2.Rodrigues(np.array([0.5, 2.0, 0.3]))[0]
     pose[:3, 3] = 300, -200, 50
     K = np.array([[300.0, 0, WIDTH / 2], [0, 300, HEIGHT / 2], [0, 0, 1]])
-    return Camera("photographs/left.png", WIDTH, HEIGHT, K, pose)
+    return Camera("images/left.png", WIDTH, HEIGHT, K, pose)
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def gaussians(camera: Camera) -> Gaussians:
     ball = rng.normal(size=(100, 3)) * 0.5 + [8, 3, 30]
     colours = np.stack([x + 0.5, y + 0.5, 0.5 + 0.4 * np.sin(20 * x * y)], axis=1)
     colours = np.concatenate([np.full((len(front), 3), (0.1, 0.1, 0.6)), colours, np.full((100, 3), (1, 0.8, 0))])
-    local = np.concatenate([front, wall, ball])  # not in the order in which they are to be drawn
+    local = np.concatenate([front, wall, ball])  # not in the order in which they are to be composited
     scales = rng.uniform(0.5, 1.2, local.shape) * [1, 1, 0.1]
     turned = np.stack([cv2.Rodrigues(vector)[0] for vector in rng.normal(size=(len(local), 3)) * 0.3])
     quats = matrices_to_quaternions(camera.extrinsics[:3, :3] @ turned)
@@ -62,23 +62,23 @@ def gaussians(camera: Camera) -> Gaussians:
 
 
 @pytest.fixture(scope="module")
-def drawn(camera: Camera, gaussians: Gaussians) -> np.ndarray:
+def rendered(camera: Camera, gaussians: Gaussians) -> np.ndarray:
     """What the camera sees, by the rasteriser."""
     return render_view(gaussians, camera.extrinsics, camera.K, WIDTH, HEIGHT, WHITE).rgb
 
 
 @pytest.fixture(scope="module")
-def folder(camera: Camera, gaussians: Gaussians, drawn: np.ndarray, tmp_path_factory) -> Path:
-    """A splat file, two cameras and the photographs that they took."""
+def folder(camera: Camera, gaussians: Gaussians, rendered: np.ndarray, tmp_path_factory) -> Path:
+    """A splat file, two cameras and their images."""
     folder = tmp_path_factory.mktemp("look")
     write_ply(folder / "scene.ply", gaussians)
     beside = camera.extrinsics.copy()
     beside[:3, 3] += 6 * beside[:3, 0] + 10 * beside[:3, 2]
-    right = Camera("photographs/right.png", WIDTH, HEIGHT, camera.K, beside)
+    right = Camera("images/right.png", WIDTH, HEIGHT, camera.K, beside)
     write_cameras(folder / "cameras.json", [camera, right])
-    (folder / "photographs").mkdir()
-    save_png(folder / "photographs" / "left.png", drawn)
-    save_png(folder / "photographs" / "right.png", np.full((HEIGHT, WIDTH, 3), (1.0, 0, 1.0)))
+    (folder / "images").mkdir()
+    save_png(folder / "images" / "left.png", rendered)
+    save_png(folder / "images" / "right.png", np.full((HEIGHT, WIDTH, 3), (1.0, 0, 1.0)))
     return folder
 
 
@@ -120,16 +120,16 @@ def similarity(first: np.ndarray, second: np.ndarray) -> float:
     return ssim(first, second, np.ones(first.shape[:2], bool))
 
 
-def shows(scene: np.ndarray, drawn: np.ndarray) -> None:
-    """A picture shows what was drawn, the right way round."""
-    assert similarity(scene, drawn) > SIMILAR
-    assert similarity(scene[::-1], drawn) < TURNED
-    assert similarity(scene[:, ::-1], drawn) < TURNED
+def shows(scene: np.ndarray, rendered: np.ndarray) -> None:
+    """An image shows what was rendered, the right way round."""
+    assert similarity(scene, rendered) > SIMILAR
+    assert similarity(scene[::-1], rendered) < TURNED
+    assert similarity(scene[:, ::-1], rendered) < TURNED
 
 
 @pytest.fixture
 def opened(browser):
-    """Opens pages, and closes them after the test: they go on drawing."""
+    """Opens pages, and closes them after the test: they go on rendering."""
     pages = []
 
     def open_page(address: str) -> Page:
@@ -158,29 +158,29 @@ def served(folder):
         process.wait()
 
 
-def test_served_page(opened, served, drawn):
+def test_served_page(opened, served, rendered):
     address = served("scene.ply", "--cameras", "cameras.json", "--port", 0, "--no-browser")
     page = opened(address)
-    scene = page.scene(drawn[:, :FREE])
-    shows(scene[:, :FREE], drawn[:, :FREE])
+    scene = page.scene(rendered[:, :FREE])
+    shows(scene[:, :FREE], rendered[:, :FREE])
     assert (scene[:, FREE:].max(axis=2) < 0.3).any()  # the lines of the other camera
     assert page.complaints == []
     assert all(url.startswith((address, "blob:", "data:")) for url in page.requests)
 
 
-def test_a_click_at_a_camera_leads_there(opened, served, folder, gaussians, drawn):
-    cameras = ("--cameras", "cameras.json", "--images", "photographs")
+def test_a_click_at_a_camera_leads_there(opened, served, folder, gaussians, rendered):
+    cameras = ("--cameras", "cameras.json", "--images", "images")
     page = opened(served("scene.ply", *cameras, "--port", 0, "--no-browser"))
-    rows, columns = magenta(page.scene(drawn[:, :FREE])).nonzero()
-    page.page.mouse.click(float(np.median(columns)), float(np.median(rows)))  # through the photograph of the first
+    rows, columns = magenta(page.scene(rendered[:, :FREE])).nonzero()
+    page.page.mouse.click(float(np.median(columns)), float(np.median(rows)))  # through the image of the first camera
     right = read_cameras(folder / "cameras.json")[1]
     there = render_view(gaussians, right.extrinsics, right.K, WIDTH, HEIGHT, WHITE).rgb
-    assert similarity(there, drawn) < TURNED
+    assert similarity(there, rendered) < TURNED
     shows(page.scene(there), there)
     assert page.complaints == []
 
 
-def test_photographs_from_a_video(tmp_path, camera):
+def test_images_from_a_video(tmp_path, camera):
     film = cv2.VideoWriter(str(tmp_path / "clip.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 30, (WIDTH, HEIGHT))
     for grey in (50, 100, 150):
         film.write(np.full((HEIGHT, WIDTH, 3), grey, np.uint8))
@@ -188,24 +188,24 @@ def test_photographs_from_a_video(tmp_path, camera):
     cameras = [replace(camera, name=f"clip-{number:06}.png") for number in (0, 2)]
     write_cameras(tmp_path / "cameras.json", cameras)
     viewpoints = read_viewpoints(tmp_path / "cameras.json", None, [tmp_path / "clip.avi"])
-    assert [round(float(view.photograph.mean()), -1) for view in viewpoints] == [50, 150]
+    assert [round(float(view.image.mean()), -1) for view in viewpoints] == [50, 150]
 
 
 def magenta(scene: np.ndarray) -> np.ndarray:
-    """Where the other camera's photograph is seen, [height, width]."""
+    """Where the other camera's image is seen, [height, width]."""
     return (scene > [0.8, -1, 0.8]).all(axis=2) & (scene[..., 1] < 0.3)
 
 
-def test_file_to_send(opened, folder, drawn, tmp_path, monkeypatch, capsys):
+def test_file_to_send(opened, folder, rendered, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     html = tmp_path / "<b>scene.html"
-    arguments = ("scene.ply", "--cameras", "cameras.json", "--images", "photographs", "--html", html)
+    arguments = ("scene.ply", "--cameras", "cameras.json", "--images", "images", "--html", html)
     assert run_command(main, *arguments) == 0
     assert capsys.readouterr().out.startswith(f"wrote {html}: 1,117 Gaussians, ")
     page = opened(html.as_uri())
-    scene = page.scene(drawn[:, :FREE])
-    shows(scene[:, :FREE], drawn[:, :FREE])
-    assert magenta(scene[:, FREE:]).sum() > 500  # the other camera's photograph; its own is not in the way
+    scene = page.scene(rendered[:, :FREE])
+    shows(scene[:, :FREE], rendered[:, :FREE])
+    assert magenta(scene[:, FREE:]).sum() > 500  # the other camera's image; its own is not in the way
     assert page.complaints == []
     assert all(url.startswith(("file:", "blob:", "data:")) for url in page.requests)
 
@@ -214,8 +214,8 @@ def test_scene_without_cameras(opened, folder, gaussians, tmp_path):
     html = tmp_path / "scene.html"
     assert run_command(main, folder / "scene.ply", "--html", html) == 0
     above = overview_camera(gaussians, HEIGHT, WIDTH)
-    drawn = render_view(gaussians, above.extrinsics, above.K, WIDTH, HEIGHT, WHITE).rgb
-    shows(opened(html.as_uri()).scene(drawn), drawn)
+    rendered = render_view(gaussians, above.extrinsics, above.K, WIDTH, HEIGHT, WHITE).rgb
+    shows(opened(html.as_uri()).scene(rendered), rendered)
 
 
 def elsewhere(camera: Camera) -> Camera:
@@ -226,7 +226,7 @@ def elsewhere(camera: Camera) -> Camera:
 REFUSED = {
     "a page that is none": (("scene.ply", "--html", "scene.ply"), "ends in .html"),
     "a page in no folder": (("scene.ply", "--html", "scene.ply/page.html"), "scene.ply is not a folder"),
-    "photographs without cameras": (("scene.ply", "--images", "photographs"), "give --cameras"),
+    "images without cameras": (("scene.ply", "--images", "images"), "give --cameras"),
     "cameras of another scene": (("scene.ply", "--cameras", "elsewhere.json", "--html", "x.html"), "sees nothing"),
     "no scene": (("nothing.ply",), "nothing.ply"),
     "another machine's address": (("scene.ply", "--host", "203.0.113.1"), "cannot serve at 203.0.113.1"),

@@ -143,7 +143,7 @@ def test_sizes_need_no_decoding_and_cut_files_are_damaged(tmp_path, suffix, monk
 
 
 def test_what_is_no_image_has_no_size(tmp_path):
-    (tmp_path / "text.jpg").write_text("not a picture")
+    (tmp_path / "text.jpg").write_text("not an image")
     Image.new("RGB", (4, 4)).save(tmp_path / "a.gif")
     (tmp_path / "a.gif").rename(tmp_path / "gif.png")
     for name in ("text.jpg", "gif.png", "absent.jpg", "."):

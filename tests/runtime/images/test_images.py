@@ -1,4 +1,4 @@
-"""Photographs: found, read upright, undistorted and fitted, with the geometry held against OpenCV's projection."""
+"""Images: found, read upright, undistorted and fitted, with the geometry held against OpenCV's projection."""
 
 import struct
 from dataclasses import replace
@@ -15,7 +15,7 @@ from idesplat.runtime.images.finding import describe_unsupported, find_images, u
 from idesplat.runtime.images.io import load_image
 from idesplat.runtime.images.resizing import cover_crop, resize_and_crop
 
-# rows of the upright picture, in RGB: red, green / blue, white / grey, black
+# rows of the upright image, in RGB: red, green / blue, white / grey, black
 UPRIGHT = np.array(
     [[[250, 10, 10], [10, 250, 10]], [[10, 10, 250], [250, 250, 250]], [[128, 128, 128], [5, 5, 5]]], np.uint8
 )
@@ -161,7 +161,7 @@ def test_what_cannot_be_read(tmp_path):
     cv2.imwrite(str(tmp_path / "float.tiff"), np.ones((2, 2, 3), np.float32))
     save(tmp_path / "whole.png", UPRIGHT.repeat(20, axis=0))
     (tmp_path / "cut.png").write_bytes((tmp_path / "whole.png").read_bytes()[:40])
-    (tmp_path / "text.jpg").write_text("not a picture")
+    (tmp_path / "text.jpg").write_text("not an image")
     (tmp_path / "empty.jpg").write_bytes(b"")
     for name, expected in (
         ("float.tiff", "holds float32"),
@@ -181,19 +181,19 @@ POINTS = np.array([[x, y, 2.0 + 0.5 * x] for x in (-0.5, 0.1, 0.6) for y in (-0.
 
 
 def blobs(height, width, centres, sigma):
-    """A black picture with a soft dot at each centre (pixel centres at .5), sampled at the pixel centres."""
+    """A black image with a soft dot at each centre (pixel centres at .5), sampled at the pixel centres."""
     y, x = np.mgrid[:height, :width] + 0.5
-    picture = sum(np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2 * sigma**2)) for cx, cy in centres)
-    return np.repeat(np.rint(255 * np.minimum(picture, 1)).astype(np.uint8)[..., None], 3, axis=2)
+    image = sum(np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2 * sigma**2)) for cx, cy in centres)
+    return np.repeat(np.rint(255 * np.minimum(image, 1)).astype(np.uint8)[..., None], 3, axis=2)
 
 
-def centroid(picture, around, radius):
-    """Centre of a dot, in pixels with centres at .5, of a picture [height, width].
+def centroid(image, around, radius):
+    """Centre of a dot, in pixels with centres at .5, of an image [height, width].
 
     Weights are squared, so that 8-bit rounding in the dot's wide skirt counts little.
     """
-    y, x = np.mgrid[: picture.shape[0], : picture.shape[1]] + 0.5
-    weight = np.where(np.hypot(x - around[0], y - around[1]) < radius, picture.astype(float) ** 2, 0)
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]] + 0.5
+    weight = np.where(np.hypot(x - around[0], y - around[1]) < radius, image.astype(float) ** 2, 0)
     return np.array([(weight * x).sum(), (weight * y).sum()]) / weight.sum()
 
 
@@ -250,13 +250,13 @@ def test_undistort_against_opencv_projection(distortion):
 
 
 def test_what_the_lens_saw_against_opencv_projection():
-    """A pixel of the straight picture was seen if its ray, bent by the lens, meets the photograph."""
+    """A pixel of the undistorted image was seen if its ray, distorted by the lens, meets the input image."""
     K = np.array([[60.0, 0, 48], [0, 60, 36], [0, 0, 1]])
     camera = Camera("a", 96, 72, K, np.eye(4), (0.2, 0.05, 0.002, -0.001))
     x, y = np.meshgrid(np.arange(96) + 0.5, np.arange(72) + 0.5)
     rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ np.linalg.inv(K).T
     bent = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, np.array(camera.distortion))[0].reshape(72, 96, 2)
-    # the photograph has no colour beyond its outermost pixel centres
+    # the input image has no colour beyond its outermost pixel centres
     expected = ((bent > 0.5) & (bent < (95.5, 71.5))).all(axis=-1)
     assert 0.5 < expected.mean() < 0.95
     assert (undistortion_valid_mask(camera) == expected).mean() > 0.999

@@ -65,7 +65,7 @@ def test_mistakes(clip, tmp_path):
             video.extract_sharp_frames(tmp_path / name, tmp_path)
     with pytest.raises(InputError, match=r"clip\.avi: the cameras do not name its frames, such as clip-000000\.png"):
         video.extract_named_frames(clip, ["a.png", "other-000003.png"], tmp_path)
-    with pytest.raises(InputError, match="the cameras do not name its frames"):  # but photographs of another capture
+    with pytest.raises(InputError, match="the cameras do not name its frames"):  # but images of another capture
         video.extract_named_frames(clip, ["0001.jpg", "0002.jpg", "0007.jpg"], tmp_path)
     with pytest.raises(InputError, match=r"damaged|expected two at least"):
         video.extract_sharp_frames(tmp_path / "cut.avi", tmp_path)

@@ -35,7 +35,7 @@ def test_damaged_or_missing_is_refused(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_finds_depth_far_better_than_one_plane_does(scene):
-    """The photographs of a drawn room: its errors are less than half of those of the best constant depth."""
+    """On images of a synthetic room, its errors are less than half of those of the best constant depth."""
     cameras = read_cameras(scene / "transforms.json")
     pairs = [(scene / cameras[view].name, cameras[view]) for view in (1, 3)]
     height, width = cameras[0].height, cameras[0].width

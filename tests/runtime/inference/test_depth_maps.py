@@ -20,7 +20,7 @@ from idesplat.runtime.views.batch import ViewBatch, build_view_batch
 from tiny_model import write_model
 
 HEIGHT, WIDTH = 64, 96
-FULL_WIDTH, FULL_HEIGHT = 120, 100  # of the photographs; 96 x 80 of them are used, less 8 rows at each end
+FULL_WIDTH, FULL_HEIGHT = 120, 100  # of the images; 96 x 80 of them are used, less 8 rows at each end
 CROP = np.array([[0.8, 0, 0], [0, 0.8, -8], [0, 0, 1]])
 NORMAL = np.array([0.3, -0.2, -1.0])  # of the plane in which all lies, at this distance from the origin
 DISTANCE = -4.0
@@ -89,7 +89,7 @@ def test_an_archive_leads_from_one_view_to_another(tmp_path: Path) -> None:
         np.testing.assert_allclose(there[inside], pixels[inside, 2], rtol=1e-3)
 
 
-def test_an_archive_says_where_in_the_photograph_it_lies(tmp_path: Path) -> None:
+def test_an_archive_says_where_in_the_image_it_lies(tmp_path: Path) -> None:
     views, prediction = plane(2)
     write_depth_maps(tmp_path, ["a", "b"], prediction, replace(views, offset=np.array([1e5, 0, 0])))
     for name, original in zip("ab", views.cameras, strict=True):
@@ -161,7 +161,7 @@ def test_colmap_reads_the_sparse_model(tmp_path: Path) -> None:
 
 @pytest.fixture
 def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Photographs of the plane, their cameras and a model, and we stand there."""
+    """Images of the plane, their cameras and a model, and we stand there."""
     monkeypatch.chdir(tmp_path)
     Path("images").mkdir()
     cameras = original_cameras(3)

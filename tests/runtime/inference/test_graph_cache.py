@@ -25,7 +25,7 @@ def cache(tmp_path, monkeypatch) -> Path:
 
 @pytest.fixture
 def model(tmp_path) -> Path:
-    """Convolutions, which ONNX Runtime optimises to what suits this processor alone."""
+    """Convolutions, which ONNX Runtime optimises to what suits this CPU alone."""
     return write_model(tmp_path / "model.onnx")
 
 
@@ -141,11 +141,11 @@ def test_without_a_folder_to_write_it_runs_all_the_same(model, tmp_path, below, 
 def test_a_cache_that_can_only_be_read_is_used(cache, model, monkeypatch):
     open_session(model)
 
-    def refuse(*arguments, **options):
+    def fail(*arguments, **options):
         raise PermissionError(13, "Permission denied")
 
     for name in ("utime", "unlink", "replace"):
-        monkeypatch.setattr(graph_cache.os, name, refuse)
+        monkeypatch.setattr(graph_cache.os, name, fail)
     opened = opened_paths(monkeypatch)
     open_session(model)
     assert opened == [str(path) for path in entries(cache)]

@@ -1,4 +1,4 @@
-"""Photographs and cameras brought together: each image is read once, damaged ones are left out, cameras name images."""
+"""Images and cameras brought together: each image is read once, damaged ones are left out, cameras name images."""
 
 import json
 import shutil
@@ -13,9 +13,8 @@ from idesplat.runtime.cameras.io import read_cameras
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.inference.inputs import Request, read_inputs
 from idesplat.runtime.sfm import estimate
-from idesplat.runtime.views import depth_range
+from idesplat.runtime.views import depth_range, sources
 from idesplat.runtime.views import loader as view_loader
-from idesplat.runtime.views import sources as photographs
 from idesplat.runtime.views.depth_range import estimate_depth_range
 from idesplat.tools.synthetic.make_scene import make_scene
 from PIL import ImageFile
@@ -39,9 +38,9 @@ class SmallModel:
 
 
 @pytest.fixture(scope="module")
-def drawn(tmp_path_factory) -> Path:
-    """Eight images of a procedural room, with transforms.json, which gives no size."""
-    folder = tmp_path_factory.mktemp("drawn")
+def room(tmp_path_factory) -> Path:
+    """Eight images of a synthetic room, with transforms.json, which gives no size."""
+    folder = tmp_path_factory.mktemp("room")
     make_scene(folder, seed=2, views=VIEWS, height=96, width=128)
     document = json.loads((folder / "transforms.json").read_text())
     for settings in (document, *document["frames"]):
@@ -60,9 +59,9 @@ def large(tmp_path_factory) -> tuple[Path, str]:
 
 
 @pytest.fixture
-def capture(drawn, tmp_path) -> Path:
-    shutil.copytree(drawn / "images", tmp_path / "images")
-    shutil.copy(drawn / "transforms.json", tmp_path)
+def capture(room, tmp_path) -> Path:
+    shutil.copytree(room / "images", tmp_path / "images")
+    shutil.copy(room / "transforms.json", tmp_path)
     return tmp_path
 
 
@@ -174,7 +173,7 @@ def test_unread_formats_are_said(capture):
 
 
 def named(cameras: Path, folder: Path) -> list[Path]:
-    return photographs.find_input_images([], cameras, None, folder)
+    return sources.find_input_images([], cameras, None, folder)
 
 
 def test_cameras_name_their_images(capture):
@@ -197,7 +196,7 @@ def test_images_beside_the_file_and_names_without_suffix(capture):
     with pytest.raises(InputError, match=r"transforms\.json: none of the 8 images that it names .* give --images"):
         named(capture / "transforms.json", capture)
     with pytest.raises(InputError, match="--images is missing"):
-        photographs.find_input_images([], None, None, capture)
+        sources.find_input_images([], None, None, capture)
 
 
 def test_colmap_models_find_their_images(capture):

@@ -88,7 +88,7 @@ def test_it_computes_the_same(exported):
     try:
         predictor = Predictor(exported[0], "OpenVINO")
     except InputError as error:
-        pytest.skip(str(error))  # on a processor that is not Intel's
+        pytest.skip(str(error))  # on a CPU that is not Intel's
     inputs = example_inputs(3, 64, 96, 0.5, 100.0)
     arrays = [inputs[name].numpy() for name in INPUTS]
     expected, found = Predictor(exported[0]).predict_arrays(*arrays), predictor.predict_arrays(*arrays)

@@ -28,7 +28,7 @@ def arrays():
     return {name: inputs[name].numpy().copy() for name in INPUTS[:3]}
 
 
-def test_predict_takes_photographs_and_cameras(predictor, scene):
+def test_predict_takes_images_and_cameras(predictor, scene):
     cameras = read_cameras(scene / "transforms.json")[:2]
     from_files = predictor.predict([scene / camera.name for camera in cameras], cameras)
     from_arrays = predictor.predict([load_image(scene / camera.name) for camera in cameras], cameras)
@@ -38,7 +38,7 @@ def test_predict_takes_photographs_and_cameras(predictor, scene):
 
 
 def test_floating_point_images_are_not_darkened(predictor, scene):
-    """The same photograph, as bytes and as floating point in [0, 1]."""
+    """The same image, as bytes and as floating point in [0, 1]."""
     cameras = read_cameras(scene / "transforms.json")[:2]
     images = [load_image(scene / camera.name) for camera in cameras]
     expected = predictor.predict(images, cameras)
@@ -120,7 +120,7 @@ def test_a_scene_in_any_unit_and_place_gives_the_same(predictor, arrays, unit, p
     poses = arrays["extrinsics"].astype(np.float64)
     poses[:, :3, 3] = poses[:, :3, 3] * unit + position
     moved = predictor.predict_arrays(arrays["images"], poses, arrays["intrinsics"], near=0.8 * unit, far=40 * unit)
-    # Rounding may carry a projection over a pixel's edge, where nearest-neighbour warping picks another feature.
+    # Rounding may move a projection across a pixel's edge, where nearest-neighbour warping picks another feature.
     close = np.abs(moved.depth / unit - expected.depth) < 1e-4 * expected.depth
     assert close.mean() > 0.999
     means = (moved.gaussians.means - np.array(position)) / unit
@@ -131,7 +131,7 @@ def test_a_scene_in_any_unit_and_place_gives_the_same(predictor, arrays, unit, p
     np.testing.assert_allclose(moved.gaussians.quats, expected.gaussians.quats, atol=1e-2)
 
 
-def spoil(name, index, value):
+def corrupt(name, index, value):
     def change(arrays):
         arrays[name][index] = value
 
@@ -139,12 +139,12 @@ def spoil(name, index, value):
 
 
 BAD_ARRAYS = {
-    "NaN in the images": (spoil("images", (0, 0, 0, 0), np.nan), "images"),
-    "NaN in a pose": (spoil("extrinsics", (1, 0, 3), np.nan), "extrinsics"),
-    "NaN in the intrinsics": (spoil("intrinsics", (0, 0, 0), np.nan), "intrinsics"),
-    "zero focal length": (spoil("intrinsics", (0, 0, 0), 0), "intrinsics"),
-    "mirrored pose": (spoil("extrinsics", (1, slice(None), 0), [-1, 0, 0, 0]), "extrinsics"),
-    "pixels of 255": (spoil("images", 0, 255), "0 to 1"),
+    "NaN in the images": (corrupt("images", (0, 0, 0, 0), np.nan), "images"),
+    "NaN in a pose": (corrupt("extrinsics", (1, 0, 3), np.nan), "extrinsics"),
+    "NaN in the intrinsics": (corrupt("intrinsics", (0, 0, 0), np.nan), "intrinsics"),
+    "zero focal length": (corrupt("intrinsics", (0, 0, 0), 0), "intrinsics"),
+    "mirrored pose": (corrupt("extrinsics", (1, slice(None), 0), [-1, 0, 0, 0]), "extrinsics"),
+    "pixels of 255": (corrupt("images", 0, 255), "0 to 1"),
     "one view": (lambda arrays: arrays.update({k: v[:1] for k, v in arrays.items()}), "at least 2"),
     "same camera twice": (lambda arrays: arrays["extrinsics"].__setitem__(1, arrays["extrinsics"][0]), "same"),
     "counts that differ": (lambda arrays: arrays.update(extrinsics=arrays["extrinsics"][:1]), "extrinsics"),

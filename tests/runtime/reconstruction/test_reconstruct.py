@@ -61,17 +61,17 @@ def test_what_a_reconstruction_holds_and_saves(place, scene):
     assert len(depth) == 4 and len(renders) == 26 and all(path.is_file() for path in (*depth, *renders))
     made.save_report("report.html")
     assert "2 " in Path("report.html").read_text()
-    assert made.summary()["cleaned"]["left_out"] == made.removed
+    assert made.summary()["filtered"]["left_out"] == made.removed
 
 
 def test_inputs_are_checked_before_the_model_is_loaded(place, scene, monkeypatch):
     monkeypatch.setattr(pipeline, "Predictor", lambda *given: pytest.fail("loaded"))
 
-    def refuse(inputs) -> None:
+    def fail(inputs) -> None:
         raise InputError(f"not {len(inputs.cameras)}")
 
     with pytest.raises(InputError, match="not 5"):
-        run(scene, on_inputs=refuse)
+        run(scene, on_inputs=fail)
     with pytest.raises(InputError, match="expected near < far"):
         run(scene, near=3.0, far=2.0)
     with pytest.raises(InputError, match="no such"):

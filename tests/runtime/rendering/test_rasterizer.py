@@ -1,6 +1,6 @@
-"""The rasteriser against gsplat's reference images, and against a slow twin that says plainly what it computes.
+"""The rasteriser against gsplat's reference images, and against a slow reference implementation.
 
-What it draws is asked of both ways in which it draws: with NumPy, and compiled by numba.
+Both kernels are tested: NumPy, and compiled by numba.
 """
 
 import itertools
@@ -33,7 +33,7 @@ def use_steps(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
 
 @pytest.fixture(params=STEPS)
 def steps(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Draw with NumPy, then compiled."""
+    """Render with NumPy, then compiled."""
     use_steps(monkeypatch, request.param)
     return request.param
 
@@ -53,9 +53,9 @@ def test_numba_is_used_where_it_is_installed() -> None:
 @pytest.mark.parametrize("case", ["random", "feedforward"])
 def test_matches_gsplat(case: str) -> None:
     reference = np.load(DATA / f"raster-{case}" / "reference.npz")
-    drawn = rasterize(*reference_case(case))
+    rendered = rasterize(*reference_case(case))
     for name in Rendering._fields:
-        ours, theirs = getattr(drawn, name), reference[name]
+        ours, theirs = getattr(rendered, name), reference[name]
         assert ours.dtype == np.float32
         assert ours.shape == theirs.shape
         error = ours.astype(np.float64) - theirs
@@ -72,11 +72,13 @@ def test_compiled_matches_numpy(case: str | int, monkeypatch: pytest.MonkeyPatch
     use_steps(monkeypatch, "numpy")
     expected = rasterize(*scene)
     use_steps(monkeypatch, "compiled")
-    drawn = rasterize(*scene)
+    rendered = rasterize(*scene)
     for name in Rendering._fields:
         theirs = getattr(expected, name)
         # Depth is in scene units, so its rounding grows with it; the others reach 1.
-        np.testing.assert_allclose(getattr(drawn, name), theirs, rtol=0, atol=1e-5 * max(1, theirs.max()), err_msg=name)
+        np.testing.assert_allclose(
+            getattr(rendered, name), theirs, rtol=0, atol=1e-5 * max(1, theirs.max()), err_msg=name
+        )
 
 
 @pytest.mark.parametrize(
@@ -86,14 +88,14 @@ def test_compiled_matches_numpy(case: str | int, monkeypatch: pytest.MonkeyPatch
         pytest.param("def njit(**options): raise RuntimeError('no locator available')", id="nowhere to cache"),
     ],
 )
-def test_draws_where_nothing_can_be_compiled(numba: str, tmp_path: Path) -> None:
+def test_renders_where_nothing_can_be_compiled(numba: str, tmp_path: Path) -> None:
     (tmp_path / "numba.py").write_text(numba)
     program = (
         "from idesplat.runtime.rendering import rasterizer\n"
         "import numpy as np\n"
         "g = np.zeros((1, 3)) + [0, 0, 2], np.ones((1, 4)), np.ones((1, 3)), np.ones(1), np.zeros((1, 1, 3))\n"
-        "drawn = rasterizer.rasterize(*g, np.eye(4), np.diag([8.0, 8.0, 1.0]), 8, 8)\n"
-        "assert drawn.alpha[0, 0] > 0.9 and rasterizer._kernels()[0] is rasterizer.rasterizer_numpy.project\n"
+        "rendered = rasterizer.rasterize(*g, np.eye(4), np.diag([8.0, 8.0, 1.0]), 8, 8)\n"
+        "assert rendered.alpha[0, 0] > 0.9 and rasterizer._kernels()[0] is rasterizer.rasterizer_numpy.project\n"
     )
     environment = os.environ | {"PYTHONPATH": str(tmp_path)}
     subprocess.run([sys.executable, "-c", program], check=True, env=environment, timeout=60)
@@ -109,14 +111,14 @@ def test_depths_are_sorted_as_numpy_sorts_them() -> None:
 
 @pytest.mark.usefixtures("steps")
 @pytest.mark.parametrize("seed", range(24))
-def test_matches_slow_twin(seed: int) -> None:
+def test_matches_slow_reference(seed: int) -> None:
     rng = np.random.default_rng(seed)
     scene = random_scene(rng, splats=int(rng.integers(1, 120)), degree=seed % 4)
-    drawn = rasterize(*scene)
+    rendered = rasterize(*scene)
     expected = slow_rasterize(*scene)
     for name in Rendering._fields:
         # A hundred float32 roundings of numbers up to the farthest depth, 8.
-        np.testing.assert_allclose(getattr(drawn, name), expected[name], rtol=0, atol=100 * 8 * 6e-8, err_msg=name)
+        np.testing.assert_allclose(getattr(rendered, name), expected[name], rtol=0, atol=100 * 8 * 6e-8, err_msg=name)
 
 
 def test_many_chunks_give_what_one_gives(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -134,7 +136,7 @@ def test_many_chunks_give_what_one_gives(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 @pytest.mark.usefixtures("steps")
-def test_nothing_to_draw_shows_the_background() -> None:
+def test_nothing_to_render_shows_the_background() -> None:
     empty = gaussians_at(np.zeros((0, 3)))
     behind = gaussians_at(np.array([[0, 0, -2.0], [0.1, 0, -0.5], [0, 0, 0.005]]))
     beside = gaussians_at(np.array([[500.0, 0, 1.0], [0, -500.0, 1.0]]))
@@ -186,12 +188,12 @@ def test_needles_and_extremes_stay_finite() -> None:
     scales = 10.0 ** rng.uniform(-30, 30, (60, 3))
     quats = rng.normal(size=(60, 4))
     quats[2] = 0
-    drawn = rasterize(
+    rendered = rasterize(
         means, quats, scales, rng.uniform(size=60), np.zeros((60, 4, 3)), np.eye(4), pinhole(64, 48), 64, 48
     )
-    for image in drawn:
+    for image in rendered:
         assert np.isfinite(image).all()
-    assert drawn.alpha.max() <= 1
+    assert rendered.alpha.max() <= 1
 
 
 @pytest.mark.usefixtures("steps")
@@ -199,12 +201,12 @@ def test_memory_does_not_grow_with_overdraw() -> None:
     """300 veils over the whole image are 23 million fragments; at some 60 bytes each they would take 1.4 GB at once."""
     means, quats, _, _, sh = gaussians_at(np.random.default_rng(0).normal(size=(300, 3)) * 0.01 + [0, 0, 5])
     tracemalloc.start()
-    drawn = rasterize(
+    rendered = rasterize(
         means, quats, np.full((300, 3), 50.0), np.full(300, 0.005), sh, np.eye(4), pinhole(320, 240), 320, 240
     )
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    np.testing.assert_allclose(drawn.alpha, 1 - 0.995**300, atol=1e-2)
+    np.testing.assert_allclose(rendered.alpha, 1 - 0.995**300, atol=1e-2)
     assert peak < 250e6
 
 
@@ -363,14 +365,14 @@ def slow_rasterize(
         dx, dy = column - (fx * x / z + cx), row - (fy * y / z + cy)
         sigma = 0.5 * (conic[0, 0] * dx**2 + conic[1, 1] * dy**2) + conic[0, 1] * dx * dy
         alpha = np.minimum(0.99, float(opacities[index]) * np.exp(-sigma))
-        drawn = (alpha >= 1 / 255) & ~closed
+        visible = (alpha >= 1 / 255) & ~closed
         passed = transmittance * (1 - alpha)
-        closed |= drawn & (passed <= 1e-4)
-        weight = np.where(drawn & ~closed, alpha * transmittance, 0)
-        transmittance = np.where(drawn & ~closed, passed, transmittance)
+        closed |= visible & (passed <= 1e-4)
+        weight = np.where(visible & ~closed, alpha * transmittance, 0)
+        transmittance = np.where(visible & ~closed, passed, transmittance)
 
         direction = means[index] - camera_position
-        colour = harmonics(direction / np.linalg.norm(direction), sh.shape[1]) @ sh[index] + 0.5
+        colour = sh_basis(direction / np.linalg.norm(direction), sh.shape[1]) @ sh[index] + 0.5
         rgb += weight[..., None] * np.maximum(colour, 0)
         alpha_sum += weight
         depth += weight * z
@@ -384,7 +386,7 @@ def rotation_matrix(quat: np.ndarray) -> np.ndarray:
     return np.eye(3) + 2 * w * cross + 2 * cross @ cross
 
 
-def harmonics(direction: np.ndarray, coefficients: int) -> np.ndarray:
+def sh_basis(direction: np.ndarray, coefficients: int) -> np.ndarray:
     """Real spherical harmonics from their definition, with the Condon-Shortley phase, in order of degree then order."""
     x, y, z = direction
     azimuth = np.arctan2(y, x)

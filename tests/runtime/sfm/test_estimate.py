@@ -1,4 +1,4 @@
-"""Cameras from photographs alone, compared with the known cameras of a synthetic room."""
+"""Cameras from images alone, compared with the known cameras of a synthetic room."""
 
 import cv2
 import numpy as np
@@ -16,7 +16,7 @@ FOCAL_LENGTH_35MM = 0xA405  # EXIF 2.32
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
-    """Photographs of a drawn room, and their true cameras."""
+    """Images of a synthetic room, and their true cameras."""
     folder = tmp_path_factory.mktemp("room")
     make_scene(folder, seed=2, views=3, height=360, width=480)
     cameras = read_cameras(folder / "transforms.json")
@@ -31,16 +31,16 @@ def relative_errors(found, known, first=0, second=1):
     return np.degrees(turn), np.degrees(np.arccos(a @ b / np.linalg.norm(a) / np.linalg.norm(b)))
 
 
-def test_two_photographs(room):
-    pictures, known = room
-    found = estimate_cameras([pictures[0], pictures[2]], str(known[0].K[0, 0]))
+def test_two_images(room):
+    paths, known = room
+    found = estimate_cameras([paths[0], paths[2]], str(known[0].K[0, 0]))
     rotation, direction = relative_errors(found, [known[0], known[2]])
     assert rotation < 0.5 and direction < 3
-    assert [camera.name for camera in found] == [str(pictures[0]), str(pictures[2])]
+    assert [camera.name for camera in found] == [str(paths[0]), str(paths[2])]
     np.testing.assert_array_equal(found[0].extrinsics, np.eye(4))
     np.testing.assert_allclose(found[0].K, known[0].K, atol=1e-9)
     # The unit is the median depth: the true one, in the true unit, tells the scale.
-    depth = np.load(pictures[0].parent.parent / "depth" / f"{pictures[0].stem}.npz")["depth"]
+    depth = np.load(paths[0].parent.parent / "depth" / f"{paths[0].stem}.npz")["depth"]
     baseline = np.linalg.norm(known[2].extrinsics[:3, 3] - known[0].extrinsics[:3, 3])
     scale = np.linalg.norm(found[1].extrinsics[:3, 3]) / baseline
     assert 0.6 < np.median(depth) * scale < 1.6
@@ -49,11 +49,11 @@ def test_two_photographs(room):
 
 
 @pytest.mark.slow
-def test_three_photographs_through_the_mapper(room):
-    pictures, known = room
+def test_three_images_through_the_mapper(room):
+    paths, known = room
     for focal in (str(known[0].K[0, 0]), None):
-        found = estimate_cameras(pictures, focal)
-        assert [camera.name for camera in found] == [str(picture) for picture in pictures]
+        found = estimate_cameras(paths, focal)
+        assert [camera.name for camera in found] == [str(path) for path in paths]
         np.testing.assert_allclose(found[0].extrinsics, np.eye(4), atol=1e-12)
         for i, j in ((0, 1), (0, 2), (1, 2)):
             rotation, direction = relative_errors(found, known, i, j)
@@ -69,18 +69,18 @@ def test_three_photographs_through_the_mapper(room):
 
 
 def test_exif_tells_the_focal_length(room, tmp_path):
-    pictures, known = room
+    paths, known = room
     width, height = known[0].width, known[0].height
     film = round(known[0].K[0, 0] * np.hypot(36, 24) / np.hypot(width, height))
     tagged = []
-    for picture in (pictures[0], pictures[2]):
-        image = Image.open(picture)
+    for path in (paths[0], paths[2]):
+        image = Image.open(path)
         exif = image.getexif()
         exif.get_ifd(0x8769)[FOCAL_LENGTH_35MM] = film
-        tagged.append(tmp_path / f"{picture.stem}.jpg")
+        tagged.append(tmp_path / f"{path.stem}.jpg")
         image.save(tagged[-1], exif=exif, quality=98)
     assert exif_focal(tagged[0], width, height) == pytest.approx(known[0].K[0, 0], rel=0.02)  # whole millimetres
-    assert exif_focal(pictures[0], width, height) is None
+    assert exif_focal(paths[0], width, height) is None
     rotation, direction = relative_errors(estimate_cameras(tagged), [known[0], known[2]])
     assert rotation < 2 and direction < 5
 
@@ -107,7 +107,7 @@ def test_refusals(room, tmp_path, monkeypatch):
     rotated = save(tmp_path / "turned.png", cv2.warpPerspective(image, turned, image.shape[1::-1]))
     blank = save(tmp_path / "blank.png", np.full_like(image, 128))
     noise = save(tmp_path / "noise.png", np.random.default_rng(0).integers(0, 255, image.shape, np.uint8))
-    for pictures, given, expected in (
+    for paths, given, expected in (
         ([first], focal, "1 image given, expected two at least"),
         ([first, second], None, "has no focal length; give --focal"),
         ([first, second], "wide", "--focal wide: expected pixels"),
@@ -119,7 +119,7 @@ def test_refusals(room, tmp_path, monkeypatch):
         ([first, blank, noise], focal, "none of the 3 images could be registered"),
     ):
         with pytest.raises(InputError, match=expected) as caught:
-            estimate_cameras(pictures, given)
+            estimate_cameras(paths, given)
         assert "\n" not in str(caught.value)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"3 images need pycolmap \(pip install .*--frames"):
@@ -128,10 +128,10 @@ def test_refusals(room, tmp_path, monkeypatch):
 
 def test_images_as_a_phone_saves_them(room, tmp_path):
     """Noise of the sensor, another exposure in each image, and lossy compression."""
-    pictures, known = room
+    paths, known = room
     saved = []
     for index, exposure in ((0, 0.8), (2, 1.1)):
-        image = load_image(pictures[index]).astype(np.float32)
+        image = load_image(paths[index]).astype(np.float32)
         noisy = exposure * image + np.random.default_rng(index).normal(0, 5, image.shape)
         saved.append(tmp_path / f"{index}.jpg")
         rgb = np.clip(noisy, 0, 255).astype(np.uint8)

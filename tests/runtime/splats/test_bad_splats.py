@@ -90,12 +90,12 @@ def test_files_of_another_type_are_refused(tmp_path: Path, suffix: str, content:
 @pytest.mark.parametrize("field", ["means", "scales", "quats", "opacities", "sh"])
 def test_values_that_are_not_numbers_are_not_written(tmp_path: Path, truth: Gaussians, suffix: str, field: str) -> None:
     path = tmp_path / f"scene{suffix}"
-    path.write_bytes(b"the result of yesterday")
+    path.write_bytes(b"an earlier result")
     broken = Gaussians(*(getattr(truth, name).copy() for name in ARRAYS))
     getattr(broken, field)[17, ...] = np.nan
     with pytest.raises(InputError, match=r"Gaussian 17 is not"):
         write_splats(path, broken)
-    assert path.read_bytes() == b"the result of yesterday"
+    assert path.read_bytes() == b"an earlier result"
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -213,13 +213,13 @@ BROKEN_SOG = {
     "no count": (lambda files, meta: meta.update(count="5"), "count is 5"),
     "far too many": (lambda files, meta: meta.update(count=10**12), r"claim to hold \d{14,} are no scene"),
     "more than there are": (lambda files, meta: meta.update(count=17), "has 4x4 pixels for 17 values"),
-    "picture missing": (lambda files, meta: files.pop("quats.webp"), "quats.webp"),
+    "image missing": (lambda files, meta: files.pop("quats.webp"), "quats.webp"),
     "image of 268 million pixels": (
         lambda files, meta: files.update({"scales.webp": webp((16, 16, 3))[:21] + b"\xff" * 4 + b"\0" * 99}),
         "16384x16384 pixels for 5 values",
     ),
     "lossy": (lambda files, meta: files.update({"scales.webp": webp((4, 4, 3), 80)}), "not a lossless WebP"),
-    "not a picture": (lambda files, meta: files.update({"scales.webp": b"RIFF" * 20}), "not a lossless WebP"),
+    "not an image": (lambda files, meta: files.update({"scales.webp": b"RIFF" * 20}), "not a lossless WebP"),
     "without alpha": (lambda files, meta: files.update({"quats.webp": webp((4, 4, 3))}), "quats has no alpha"),
     "no largest component": (lambda files, meta: files.update({"quats.webp": webp((4, 4, 4))}), "largest component"),
     "short codebook": (lambda files, meta: meta["sh0"]["codebook"].pop(), r"sh0.codebook has shape \(255,\)"),
@@ -257,7 +257,7 @@ def test_a_bomb_in_an_archive_does_not_go_off(tmp_path: Path, written: dict[str,
         read_splats(path)
 
 
-def test_a_picture_of_one_colour_is_no_scene(tmp_path: Path, written: dict[str, bytes]) -> None:
+def test_an_image_of_one_colour_is_no_scene(tmp_path: Path, written: dict[str, bytes]) -> None:
     """A million Gaussians, 236 MB in memory, in a few kB."""
 
     def blow_up(files: dict[str, bytes], meta: dict) -> None:

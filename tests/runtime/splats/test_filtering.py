@@ -1,4 +1,4 @@
-"""Cleaning: each step on scenes so small that what it takes is known, and on a drawn room for what it is worth."""
+"""Filters of Gaussians: each on a minimal scene with a known result, and the effect on PSNR on a synthetic room."""
 
 from pathlib import Path
 
@@ -217,17 +217,17 @@ def test_what_cannot_be_asked_for(values: dict, message: str) -> None:
         filter_gaussians(one_a_pixel(wall(), poses(0, 0.5)), wall(), poses(0, 0.5), INTRINSICS, FilterOptions(**values))
 
 
-# ---- what it is worth
+# ---- effect on PSNR
 
 
 class Room:
-    """Two views of the drawn room as splats at their true depth, and a third between them to compare with."""
+    """Two views of the synthetic room as splats at their true depth, and a third between them to compare with."""
 
     def __init__(self, folder: Path) -> None:
         cameras = read_cameras(folder / "transforms.json")
         self.cameras = [cameras[index] for index in (0, 2)]
         self.between = cameras[1]
-        self.photograph = load_image(folder / self.between.name) / 255
+        self.image = load_image(folder / self.between.name) / 255
         self.images = np.stack([load_image(folder / camera.name) / 255 for camera in self.cameras])
         self.depth = np.stack(
             [np.load(folder / "depth" / f"{Path(camera.name).stem}.npz")["depth"] for camera in self.cameras]
@@ -249,10 +249,10 @@ class Room:
         )
 
     def psnr(self, gaussians: Gaussians) -> float:
-        """Of the view between, drawn from the splats of the other two."""
+        """Of the view between, rendered from the splats of the other two."""
         camera: Camera = self.between
-        drawn = render_view(gaussians, camera.extrinsics, camera.K, camera.width, camera.height)
-        return float(-10 * np.log10(np.square(np.clip(drawn.rgb, 0, 1) - self.photograph).mean()))
+        rendered = render_view(gaussians, camera.extrinsics, camera.K, camera.width, camera.height)
+        return float(-10 * np.log10(np.square(np.clip(rendered.rgb, 0, 1) - self.image).mean()))
 
 
 @pytest.fixture(scope="module")
@@ -274,10 +274,10 @@ def test_doubt_finds_what_floats_in_the_air(room: Room) -> None:
     floating = np.zeros(depth.shape, bool)
     floating[0, 30:60, 40:90] = True
     depth[floating] *= 0.6
-    spoiled = room.splats(depth)
+    damaged = room.splats(depth)
     filters = FilterOptions(min_consistency=0.5)
-    left, taken = filter_gaussians(spoiled, depth, room.extrinsics, room.intrinsics, filters)
+    left, taken = filter_gaussians(damaged, depth, room.extrinsics, room.intrinsics, filters)
     assert taken["min_consistency"] > 0.5 * floating.sum()
-    spoiled_psnr, cleaned_psnr, true_psnr = map(room.psnr, (spoiled, left, room.splats(room.depth)))
-    assert true_psnr > spoiled_psnr + 0.5
-    assert cleaned_psnr > (spoiled_psnr + true_psnr) / 2  # it wins back more than half of what they spoil
+    damaged_psnr, filtered_psnr, true_psnr = map(room.psnr, (damaged, left, room.splats(room.depth)))
+    assert true_psnr > damaged_psnr + 0.5
+    assert filtered_psnr > (damaged_psnr + true_psnr) / 2  # it recovers more than half of the loss

@@ -23,17 +23,17 @@ def truth() -> Gaussians:
 
 @pytest.mark.parametrize("signs", [OPENGL, GLTF])
 def test_a_half_turn_is_a_rotation_of_the_whole_scene(truth: Gaussians, signs: tuple[int, int, int]) -> None:
-    """Drawn by a camera that turns along, the turned scene is the same picture."""
+    """The rotated scene, rendered by the rotated camera, gives the same image."""
     turn = np.diag([*signs, 1.0])
     assert np.linalg.det(turn) == 1
     turned = convert_axes(truth, signs)
     K = np.array([[60.0, 0, 40], [0, 60.0, 30], [0, 0, 1]])
-    drawn = [
+    rendered = [
         rasterize(s.means, s.quats, s.scales, s.opacities, s.sh, viewmat, K, 80, 60).rgb
         for s, viewmat in ((truth, np.eye(4)), (turned, turn))
     ]
-    assert drawn[0].max() > 0.5
-    np.testing.assert_allclose(drawn[1], drawn[0], atol=2e-5)
+    assert rendered[0].max() > 0.5
+    np.testing.assert_allclose(rendered[1], rendered[0], atol=2e-5)
     again = convert_axes(turned, signs)
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(again, name), getattr(truth, name))

@@ -89,8 +89,8 @@ def test_the_third_degree_and_no_gaussians(tmp_path: Path, truth: Gaussians, suf
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
-def test_pictures_look_the_same(tmp_path: Path, suffix: str) -> None:
-    """Upright, at the same place and in the same colours: the picture says it all."""
+def test_renderings_look_the_same(tmp_path: Path, suffix: str) -> None:
+    """Orientation, position and colours survive: the renderings agree."""
     rng = np.random.default_rng(5)
     count = 400
     scene = Gaussians(
@@ -102,14 +102,14 @@ def test_pictures_look_the_same(tmp_path: Path, suffix: str) -> None:
     )
     write_splats(tmp_path / f"scene{suffix}", scene)
     K = np.array([[80.0, 0, 40], [0, 80.0, 30], [0, 0, 1]])
-    drawn = [
+    rendered = [
         rasterize(s.means, s.quats, s.scales, s.opacities, s.sh, np.eye(4), K, 80, 60).rgb
         for s in (scene, read_splats(tmp_path / f"scene{suffix}"))
     ]
-    psnr = -10 * np.log10(np.square(drawn[0] - drawn[1]).mean() + 1e-12)
+    psnr = -10 * np.log10(np.square(rendered[0] - rendered[1]).mean() + 1e-12)
     # Half steps of 1/510 and less in colour and opacity, and of .032 in a scale: 40 dB is an rms of .01.
     assert psnr > 40
-    assert np.square(drawn[0] - drawn[1][::-1]).mean() > 100 * np.square(drawn[0] - drawn[1]).mean()
+    assert np.square(rendered[0] - rendered[1][::-1]).mean() > 100 * np.square(rendered[0] - rendered[1]).mean()
 
 
 # ---- the files of others

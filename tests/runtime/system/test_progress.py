@@ -1,4 +1,4 @@
-"""Progress: the reports that a callback receives, and what the commands draw from them."""
+"""Progress: the reports that a callback receives, and the bars that the commands show."""
 
 import io
 import sys

@@ -1,4 +1,4 @@
-"""Near, far and the distance of a scene, held against the true depth of a drawn room."""
+"""Near, far and the distance of a scene, held against the true depth of a synthetic room."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ TRAINED = (1.0, 100.0)
 
 @pytest.fixture(scope="module")
 def room(scene):
-    """Pictures with cameras, and the true depth of each."""
+    """Images with cameras, and the true depth of each."""
     pairs = [(scene / camera.name, camera) for camera in read_cameras(scene / "transforms.json")]
     depth = [np.load(scene / "depth" / f"{path.stem}.npz")["depth"] for path, _ in pairs]
     return pairs, np.stack(depth)

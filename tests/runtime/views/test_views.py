@@ -1,4 +1,4 @@
-"""Pictures matched with cameras, views chosen, arrays made and checked."""
+"""Images matched with cameras, views chosen, arrays made and checked."""
 
 import subprocess
 import sys
@@ -88,7 +88,7 @@ def test_what_cameras_are_known_to_see_decides_the_baseline():
 
 def test_compare_knows_overlap_and_parallax():
     poses = np.stack([np.eye(4)] * 3)
-    poses[1, 0, 3] = 40 / 70  # half of the picture at a distance of 1, where 70 pixels are one unit
+    poses[1, 0, 3] = 40 / 70  # half of the image at a distance of 1, where 70 pixels are one unit
     poses[2, :3, :3] = np.diag([-1, 1, -1])  # looks back
     pairs = score_pairs(at(poses), np.ones(3))
     assert pairs.overlap[0, 1] == pairs.overlap[1, 0] == pytest.approx(0.5)
@@ -160,8 +160,8 @@ def every_pair_scored(cameras, distances):
             local = (np.c_[points, np.ones(36)] @ np.linalg.inv(second.extrinsics).T)[:, :3]
             u, v, w = (local @ second.K.T).T
             inside = (w > 0) & (u >= 0) & (v >= 0) & (u <= second.width * w) & (v <= second.height * w)
-            sights = [points - camera.extrinsics[:3, 3] for camera in (first, second)]
-            a, b = (sight / np.linalg.norm(sight, axis=1, keepdims=True) for sight in sights)
+            rays = [points - camera.extrinsics[:3, 3] for camera in (first, second)]
+            a, b = (ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays)
             angles = np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(axis=1)))
             overlap[i, j], parallax[i, j] = inside.mean(), angles[inside].mean() if inside.any() else 0
     both = (overlap > 0) & (overlap.T > 0)
@@ -225,7 +225,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
 
 @pytest.fixture
 def pairs(tmp_path):
-    """Three pictures of one colour each, and their cameras on an orbit."""
+    """Three images of one colour each, and their cameras on an orbit."""
     pairs = []
     for index, pose in enumerate(orbit([0, 5.1, 17])):
         path = tmp_path / f"{index}.png"
@@ -265,7 +265,7 @@ def test_prepare_reads_only_the_chosen_where_depths_are_known(pairs):
     )
 
 
-def test_prepare_scales_cameras_of_larger_pictures(pairs):
+def test_prepare_scales_cameras_of_larger_images(pairs):
     doubled = [
         (path, replace(camera, width=160, height=120, K=np.diag([2, 2, 1]) @ camera.K)) for path, camera in pairs
     ]

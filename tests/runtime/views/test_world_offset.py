@@ -41,7 +41,7 @@ def cameras_at(place: np.ndarray) -> list[Camera]:
 
 @pytest.fixture
 def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Photographs, their cameras at the origin and far away from it, and a model, and we stand there."""
+    """Images, their cameras at the origin and far away from it, and a model, and we stand there."""
     monkeypatch.chdir(tmp_path)
     Path("images").mkdir()
     rng = np.random.default_rng(0)
@@ -93,11 +93,11 @@ def test_an_offset_keeps_the_scene_and_is_recorded(workplace: Path, given: str) 
     with np.load("depth/0.npz") as file:
         assert file["offset"].tolist() == offset.tolist()
         np.testing.assert_allclose(file["extrinsics"][:3, 3] + offset, PLACE, atol=1e-9)
-    # the cameras stay the user's own, and lead to the same picture with the scene as drawn at once
+    # the cameras stay the user's own, and lead to the same image as rendering during inference
     for camera, original in zip(read_cameras(Path("saved.json")), cameras_at(PLACE), strict=True):
         np.testing.assert_array_equal(camera.extrinsics, original.extrinsics)
-    assert run_command(render_main, "far.ply", "--cameras", "saved.json", "--out", "drawn") == 0
-    at_once, later = (cv2.imread(path).astype(float) for path in ("views/view-0.png", "drawn/0.png"))
+    assert run_command(render_main, "far.ply", "--cameras", "saved.json", "--out", "renders") == 0
+    at_once, later = (cv2.imread(path).astype(float) for path in ("views/view-0.png", "renders/0.png"))
     assert at_once.std() > 5
     assert np.abs(at_once - later).max() <= 1
 

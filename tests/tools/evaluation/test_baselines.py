@@ -31,8 +31,8 @@ def wall(pose: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
     """A camera's image of the painted wall z = DEPTH, by intersecting rays, [3, HEIGHT, WIDTH] float32."""
     x, y = np.meshgrid((np.arange(WIDTH) + 0.5) / WIDTH, (np.arange(HEIGHT) + 0.5) / HEIGHT)
     rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(intrinsics).T @ pose[:3, :3].T
-    places = pose[:3, 3] + rays * ((DEPTH - pose[2, 3]) / rays[..., 2])[..., None]
-    u, v = places[..., 0], places[..., 1]
+    points = pose[:3, 3] + rays * ((DEPTH - pose[2, 3]) / rays[..., 2])[..., None]
+    u, v = points[..., 0], points[..., 1]
     paint = [np.sin(3.1 * u + 0.9 * v), np.sin(4.3 * v - u) * np.cos(2.2 * u), np.cos(2.7 * u * v / DEPTH)]
     return (0.5 + 0.4 * np.stack(paint)).astype(np.float32)
 

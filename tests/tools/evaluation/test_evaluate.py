@@ -53,7 +53,7 @@ def workplace(scene: Path, exported: tuple[Path, Path], opened: Predictor, tmp_p
 Capture = pytest.CaptureFixture[str]
 SCENE = ("scene", "images", "--cameras", "transforms.json", "--model", "model.onnx", "--out", "out")
 CHUNKS = ("chunks", "chunks", "--index", "index.json", "--model", "model.onnx", "--out", "out")
-PROCEDURAL = ("procedural", "--model", "model.onnx", "--out", "out", "--scenes", "1")
+SYNTHETIC = ("synthetic", "--model", "model.onnx", "--out", "out", "--scenes", "1")
 NAMED = ("--context", "000", "--context", "004", "--target", "001", "--target", "002")
 
 
@@ -184,7 +184,7 @@ def test_chunks_skip_damaged_scenes(workplace: Path, scene: Path, capsys: Captur
 
 def test_synthetic_scenes_have_true_depth(workplace: Path, opened: Predictor, capsys: Capture) -> None:
     assert len(HELD_OUT_SEEDS) == defaults.HELD_OUT_SCENES
-    assert run_command(main, *PROCEDURAL, "--views", "3") == 0
+    assert run_command(main, *SYNTHETIC, "--views", "3") == 0
     content = results()
     (only,) = content["scenes"]
     assert only["name"] == str(HELD_OUT_SEEDS[0]) and len(only["context"]) == 3
@@ -261,8 +261,8 @@ BAD = {
     "an index of longer scenes": (index({"a": {"context": [0, 9], "target": [2]}}), CHUNKS, "has 5 frames"),
     "a damaged chunk": (lambda: Path("chunks/000000.torch").write_bytes(b"x"), CHUNKS, "000000.torch"),
     "one frame of context in the index": (index({"a": {"context": [0], "target": [2]}}), CHUNKS, "1 cannot be used"),
-    "fewer pool views than views": (nothing, (*PROCEDURAL, "--pool-views", "1"), "expected at least the 2"),
-    "procedural scenes of a size it cannot take": (nothing, (*PROCEDURAL, "--size", "20x20"), "multiples of 16"),
+    "fewer pool views than views": (nothing, (*SYNTHETIC, "--pool-views", "1"), "expected at least the 2"),
+    "synthetic scenes of a size it cannot take": (nothing, (*SYNTHETIC, "--size", "20x20"), "multiples of 16"),
 }
 
 
@@ -283,5 +283,5 @@ def test_invalid_input_is_one_line_and_leaves_files_untouched(name: str, workpla
 
 def test_synthetic_scenes_need_numba(workplace: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
     monkeypatch.setattr(library, "find_spec", lambda package: None)
-    assert run_command(main, *PROCEDURAL) == 2
+    assert run_command(main, *SYNTHETIC) == 2
     assert "numba is needed" in capsys.readouterr().err

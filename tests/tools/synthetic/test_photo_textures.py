@@ -1,4 +1,4 @@
-"""Textures from photographs, and the scene kinds of training; reported scenes have neither."""
+"""Textures from images, and the scene kinds of training; reported scenes have neither."""
 
 from pathlib import Path
 

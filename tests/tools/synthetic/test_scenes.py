@@ -34,12 +34,12 @@ def scene_of(*solids: tuple[int, tuple[float, ...], tuple[float, ...], np.ndarra
         materials=np.zeros((len(shapes), 6), np.int64),
         textures=np.zeros(1, np.int64),
         uv=np.eye(2, 3)[None],
-        colors=np.eye(3, 4)[None],
+        colours=np.eye(3, 4)[None],
         frequencies=np.ones(1),
         speculars=np.zeros(1),
         emissions=np.zeros(1),
         light_positions=np.array([[0.0, -9.0, 0.0]]),
-        light_colors=np.full((1, 3), 0.5),
+        light_colours=np.full((1, 3), 0.5),
         light_reaches=np.array([1e9]),
         light_lengths=np.array([0.0]),
         ambient=np.full(3, 0.25),
@@ -151,7 +151,7 @@ def test_samples_are_well_formed() -> None:
 
 
 def warped(sample: Sample, source: int, target: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Source's points projected into target: pixels [points, 2] inside the image, z-depths, colors, and a mask."""
+    """Source's points projected into target: pixels [points, 2] inside the image, z-depths, colours, and a mask."""
     height, width = sample.depth.shape[1:]
     points = pixel_rays(sample.intrinsics[source], height, width) * sample.depth[source][..., None]
     relative = np.linalg.inv(sample.extrinsics[target].astype(np.float64)) @ sample.extrinsics[source]
@@ -159,15 +159,15 @@ def warped(sample: Sample, source: int, target: int) -> tuple[np.ndarray, np.nda
     projected = points @ sample.intrinsics[target].T
     pixels = projected[:, :2] / projected[:, 2:] * (width, height) - 0.5
     inside = ((pixels > 0) & (pixels < (width - 1.001, height - 1.001))).all(axis=1) & (points[:, 2] > 0)
-    colors = sample.images[source].reshape(3, -1).T
-    return pixels[inside], points[inside, 2], colors[inside], inside
+    colours = sample.images[source].reshape(3, -1).T
+    return pixels[inside], points[inside, 2], colours[inside], inside
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3, 4, 5, 6])
 def test_views_are_consistent_under_their_depth(seed: int) -> None:
-    """A reprojected pixel has the other view's depth and color, or is occluded there; none lies in front."""
+    """A reprojected pixel has the other view's depth and colour, or is occluded there; none lies in front."""
     sample = generate_sample(seed, 1, 2, 96, 96)
-    pixels, z, colors, inside = warped(sample, 1, 2)
+    pixels, z, colours, inside = warped(sample, 1, 2)
     assert inside.mean() > 0.3
     column, row = pixels.astype(int).T
     corners = [(row + i, column + j) for i in (0, 1) for j in (0, 1)]
@@ -181,8 +181,8 @@ def test_views_are_consistent_under_their_depth(seed: int) -> None:
     assert (z[smooth] < 0.99 * seen[smooth]).mean() < 0.005  # in front of what the other view sees
     assert met.sum() > 0.6 * smooth.sum()
     other = np.stack([sample.images[2][:, corner_row, corner_column] for corner_row, corner_column in corners])
-    difference = np.abs((weights[:, None] * other).sum(axis=0).T - colors)[met]
-    unrelated = np.abs(colors[met] - colors[met][::-1])
+    difference = np.abs((weights[:, None] * other).sum(axis=0).T - colours)[met]
+    unrelated = np.abs(colours[met] - colours[met][::-1])
     assert difference.mean() < 0.04
     assert difference.mean() < 0.4 * unrelated.mean()
 

@@ -40,9 +40,9 @@ def cache(tmp_path: Path) -> FeatureCache:
 
 
 def test_every_scene_is_used_once_per_epoch() -> None:
-    places = [scene_index(7, place, 5) for place in range(15)]
-    assert [sorted(places[epoch : epoch + 5]) for epoch in (0, 5, 10)] == [[0, 1, 2, 3, 4]] * 3
-    assert len({tuple(places[epoch : epoch + 5]) for epoch in (0, 5, 10)}) > 1
+    indices = [scene_index(7, position, 5) for position in range(15)]
+    assert [sorted(indices[epoch : epoch + 5]) for epoch in (0, 5, 10)] == [[0, 1, 2, 3, 4]] * 3
+    assert len({tuple(indices[epoch : epoch + 5]) for epoch in (0, 5, 10)}) > 1
 
 
 def test_specs_repeat_and_follow_the_probabilities() -> None:

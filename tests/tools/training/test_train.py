@@ -336,7 +336,9 @@ def test_bad_inputs_are_one_line_each(finished: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     assert "idesplat-tiny" in refused(out=out, preset="idesplat-huge")
     assert "no such preset" in refused(out=out, preset="depthsplat-small-re10k")
-    assert "multiple of 64" in refused(out=out, size=200)
+    assert "multiple of 64" in refused(out=out, size="200")
+    for size in ("64x128", "32", "32x32"):
+        assert f"--size {size}: expected a square with sides of 64 pixels at least" in refused(out=out, size=size)
     assert "use photometric" in refused(out=out, data=[tmp_path])
     assert "cannot be read" in refused(out=out, data=[tmp_path], objective=Objective.PHOTOMETRIC)
     assert "no such file" in refused(out=out, init=tmp_path / "absent.ckpt")

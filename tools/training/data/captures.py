@@ -1,4 +1,4 @@
-"""Training samples of captures: folders of photographs with transforms.json, without true depth.
+"""Training samples of captures: folders of images with transforms.json, without true depth.
 
 Every eighth image of a folder, from the first in the order of its transforms.json, is held out. Validation renders
 these from the other images; training uses none of them.

@@ -1,6 +1,6 @@
 """The README's image: input, depth, rendered held-out view and truth, of the synthetic room by the bundled model.
 
-python -P -m idesplat.tools.figures.readme_picture demo/scene docs/images/picture.png
+python -P -m idesplat.tools.figures.readme_figure demo/scene docs/images/readme.png
 """
 
 from pathlib import Path
