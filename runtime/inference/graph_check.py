@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from ..errors import InputError
-from .metadata import INPUTS, ModelMetadata, promised
+from .metadata import INPUTS, ModelMetadata, expected_outputs
 from .metadata_fields import shown
 
 FLOAT = "tensor(float)"
@@ -37,7 +37,7 @@ def check_fused(path: Path, graph: Graph, own: ModelMetadata) -> None:
     unknown = [name for name in inputs if name not in INPUTS]
     if unknown:
         raise _mismatch(path, f"it reads {shown(unknown[0])}, expected {', '.join(INPUTS)}")
-    missing = [name for name in promised(own) if name not in outputs]
+    missing = [name for name in expected_outputs(own) if name not in outputs]
     if missing:
         raise _mismatch(path, f"it does not yield {missing[0]}")
     _check_values(path, inputs, outputs, own)
@@ -73,7 +73,7 @@ def check_results(values: Mapping[str, object], views: int, height: int, width: 
         "opacities": (count,),
         "sh": (count, coefficients, 3),
     }
-    for name in promised(own):
+    for name in expected_outputs(own):
         value = values[name]
         if not isinstance(value, np.ndarray) or value.dtype != np.float32 or value.shape != shapes[name]:
             found = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
@@ -92,7 +92,7 @@ def _check_signs(values: Mapping[str, object], own: ModelMetadata) -> None:
     """Raise InputError unless depth is positive, scales at least 0 and opacities within 0 and 1."""
     ranges = {"depth": (np.nextafter(np.float32(0), 1), np.inf), "scales": (0, np.inf), "opacities": (0, 1)}
     for name, (low, high) in ranges.items():
-        value = values[name] if name in promised(own) else None
+        value = values[name] if name in expected_outputs(own) else None
         if isinstance(value, np.ndarray) and not (value.min() >= low and value.max() <= high):
             raise InputError(
                 f"the graph yields {name} from {value.min():g} to {value.max():g}, expected "

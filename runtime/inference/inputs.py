@@ -1,4 +1,4 @@
-"""What a reconstruction is made from: images or a video, their cameras or none, the views chosen of them."""
+"""Inputs of a reconstruction: images or a video, given or estimated cameras, and the selection of views."""
 
 import re
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ MIN_SHOWN_AREA = 0.7  # share of an image below which a note says that the rest 
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked for; `reconstruct` has the meaning of each field."""
+    """The arguments of a reconstruction; `reconstruct` documents each field."""
 
     images: Sequence[Path | str | np.ndarray]
     cameras: Path | str | Sequence[Camera] | None = None
@@ -47,7 +47,7 @@ class Request:
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """What the network takes, and how it came about.
+    """The chosen views, and the images and cameras that they come from.
 
     views: the chosen images with their cameras. images: the files of all, chosen or not. cameras: those of all images.
     source: where the cameras come from, a path, "estimate" or "given". notes: lines for the user.
@@ -67,7 +67,7 @@ class Inputs:
 
 @dataclass
 class _PosedImages:
-    """Images with their cameras, before views are chosen of them.
+    """Images with their cameras, before the selection of views.
 
     wanted: how many views are to be used; None for all. files: of all images that were given.
     """
@@ -106,7 +106,7 @@ def read_inputs(request: Request, model: ModelFiles) -> Inputs:
 
 
 def _posed_images(request: Request, model: ModelFiles, folder: Path) -> _PosedImages:
-    """The images with their cameras, from wherever they come. folder: for the frames of a video."""
+    """The images with their cameras, from any source. folder: for the frames of a video."""
     arrays = [image for image in request.images if isinstance(image, np.ndarray)]
     given: Path | str | Sequence[Camera] | None = request.cameras
     if arrays:
@@ -220,7 +220,7 @@ def _view_count(request: Request, model: ModelFiles, images: int) -> int | None:
 
 
 def _describe_crop(camera: Camera, height: int, width: int, model: ModelFiles) -> list[str]:
-    """A line that tells of the part of the images that is cut off, where that is much, and of a size without."""
+    """A note on the part of the images that is cropped, if it is large, and on a size that crops less."""
     crop = cover_crop(camera.width, camera.height, width, height)
     share = width * height / (crop.width * crop.height)
     if share >= MIN_SHOWN_AREA:

@@ -97,7 +97,7 @@ _ADDED_LATER = frozenset({"gaussians", "precision", "conventions"})
 _STAGE: dict[str, Check] = {"name": string, "file": string, "inputs": names, "outputs": names}
 
 
-def promised(metadata: ModelMetadata) -> Sequence[str]:
+def expected_outputs(metadata: ModelMetadata) -> Sequence[str]:
     """The outputs of a model."""
     return OUTPUTS if metadata.gaussians else OUTPUTS[:1]
 

@@ -1,4 +1,4 @@
-"""An exported model as files: what it is and what it takes, known before a graph is loaded."""
+"""The files of an exported model, with metadata that is read before a graph is loaded."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -10,7 +10,7 @@ from ..cameras.camera import Camera
 from ..errors import InputError
 from ..images.sizes import describe_size_rule, is_valid_size
 from ..system.files import open_regular
-from .metadata import INPUTS, ModelMetadata, StageFile, promised, read_manifest, read_metadata
+from .metadata import INPUTS, ModelMetadata, StageFile, expected_outputs, read_manifest, read_metadata
 from .metadata_fields import shown
 from .onnx_metadata import read_properties
 
@@ -97,7 +97,9 @@ def read_model(path: Path | str) -> ModelFiles:
     for file in files:
         _check_file(file)
     metadata = read_metadata(read_properties(files[0]), path)
-    return ModelFiles(path, metadata, stages or [StageFile(FUSED, path.name, list(INPUTS), list(promised(metadata)))])
+    return ModelFiles(
+        path, metadata, stages or [StageFile(FUSED, path.name, list(INPUTS), list(expected_outputs(metadata)))]
+    )
 
 
 def _check_file(path: Path) -> None:

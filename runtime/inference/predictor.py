@@ -15,7 +15,7 @@ from ..splats.gaussians import Gaussians
 from ..views.batch import ViewBatch, build_view_batch, check_view_arrays
 from ..views.depth_range import DepthRange, estimate_depth_range
 from .graph_check import check_fused, check_results, check_stage
-from .metadata import ModelMetadata, StageFile, promised
+from .metadata import ModelMetadata, StageFile, expected_outputs
 from .model_files import ModelFiles, read_model
 from .normalization import SceneNormalization
 from .session import CPU, DEFAULT, SessionConfig, open_session, provider_name, run_limit_s, run_session
@@ -182,7 +182,7 @@ class Predictor:
         types: dict[str, str] = {}
         for stage, session in zip(model.stages, self._sessions, strict=True):
             check_stage(model.file_of(stage), session, stage.inputs, stage.outputs, model.metadata, types)
-        missing = [name for name in promised(model.metadata) if name not in types]
+        missing = [name for name in expected_outputs(model.metadata) if name not in types]
         if missing:
             raise InputError(f"{model.path}: no stage yields {missing[0]}; export it again")
 
