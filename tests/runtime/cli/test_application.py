@@ -77,7 +77,7 @@ def test_options_that_several_commands_have_mean_the_same():
 @pytest.mark.parametrize("letters", ["-h", "--help"])
 def test_help_is_of_the_sub_command(letters, capsys):
     assert run_command(idesplat, "convert", letters) == 0
-    assert "Write a splat file in another format" in capsys.readouterr().out
+    assert "Convert a splat file to the format" in capsys.readouterr().out
 
 
 def test_completion_lists_sub_commands():
