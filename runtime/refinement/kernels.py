@@ -1,0 +1,538 @@
+"""The differentiable rasteriser compiled by numba: projection, compositing, and the way back to every parameter.
+
+The forward arithmetic is that of `rendering` (EWA splatting, Zwicker et al. 2001, with the constants of gsplat). The image
+is divided into bands of rows. Each band has the list of Gaussians that reach it, nearest first; a Gaussian in a band is an
+entry. The backward pass writes one row of gradients for each entry, and the Gaussian sums its entries in a fixed order:
+no two threads write to one place, and the result does not depend on the number of threads.
+"""
+
+import functools
+from math import log
+
+import numba
+import numpy as np
+
+from ..geometry.sh import SH_0, SH_1, SH_2, SH_3
+from ..rendering.types import DILATION, FIELD_OF_VIEW_MARGIN, MAX_ALPHA, MIN_ALPHA
+
+BAND_ROWS = 16
+MIN_TRANSMITTANCE = 1e-4
+LOG_MIN_ALPHA = log(MIN_ALPHA)
+# Columns of a projected Gaussian.
+X, Y, CONIC_XX, CONIC_XY, CONIC_YY, OPACITY, RED, GREEN, BLUE, DEPTH = range(10)
+PROJECTED = 10
+# Columns of an entry's gradients: those of the projected Gaussian up to BLUE, and its weight in the image.
+WEIGHT = 9
+ENTRY = 10
+
+compiled = functools.partial(numba.njit, cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp"})
+
+
+@compiled()
+def _rotation(quat: np.ndarray, rotation: np.ndarray) -> float:
+    """Fill the rotation matrix [3, 3] of a wxyz quaternion, and return the quaternion's length."""
+    w, x, y, z = np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
+    length = max(np.sqrt(w * w + x * x + y * y + z * z), 1e-12)
+    w, x, y, z = w / length, x / length, y / length, z / length
+    rotation[0, 0], rotation[0, 1], rotation[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    rotation[1, 0], rotation[1, 1], rotation[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    rotation[2, 0], rotation[2, 1], rotation[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    return length
+
+
+@compiled()
+def _sh_basis(x: float, y: float, z: float, basis: np.ndarray) -> None:
+    """Fill the SH basis [coefficients] at a unit direction."""
+    count = len(basis)
+    basis[0] = SH_0
+    if count > 1:
+        basis[1], basis[2], basis[3] = -SH_1 * y, SH_1 * z, -SH_1 * x
+    if count > 4:
+        xx, yy, zz = x * x, y * y, z * z
+        basis[4], basis[5] = SH_2[0] * x * y, -SH_2[0] * y * z
+        basis[6] = SH_2[1] * (2 * zz - xx - yy)
+        basis[7], basis[8] = -SH_2[0] * x * z, SH_2[2] * (xx - yy)
+        if count > 9:
+            basis[9], basis[10] = -SH_3[0] * y * (3 * xx - yy), SH_3[1] * x * y * z
+            basis[11] = -SH_3[2] * y * (4 * zz - xx - yy)
+            basis[12] = SH_3[3] * z * (2 * zz - 3 * xx - 3 * yy)
+            basis[13] = -SH_3[2] * x * (4 * zz - xx - yy)
+            basis[14], basis[15] = SH_3[4] * z * (xx - yy), -SH_3[0] * x * (xx - 3 * yy)
+
+
+@compiled()
+def _sh_gradient(x: float, y: float, z: float, worth: np.ndarray, gradient: np.ndarray) -> None:
+    """Fill the gradient [3] of sum(worth * basis) with respect to the direction; worth: [coefficients]."""
+    count = len(worth)
+    gx, gy, gz = 0.0, 0.0, 0.0
+    if count > 1:
+        gx, gy, gz = -SH_1 * worth[3], -SH_1 * worth[1], SH_1 * worth[2]
+    if count > 4:
+        a, b, c = SH_2
+        gx += a * y * worth[4] - 2 * b * x * worth[6] - a * z * worth[7] + 2 * c * x * worth[8]
+        gy += a * x * worth[4] - a * z * worth[5] - 2 * b * y * worth[6] - 2 * c * y * worth[8]
+        gz += -a * y * worth[5] + 4 * b * z * worth[6] - a * x * worth[7]
+    if count > 9:
+        p, q, r, s, t = SH_3
+        xx, yy, zz = x * x, y * y, z * z
+        gx += -6 * p * x * y * worth[9] + q * y * z * worth[10] + 2 * r * x * y * worth[11] - 6 * s * x * z * worth[12]
+        gx += -r * (4 * zz - 3 * xx - yy) * worth[13] + 2 * t * x * z * worth[14] - 3 * p * (xx - yy) * worth[15]
+        gy += -3 * p * (xx - yy) * worth[9] + q * x * z * worth[10] - r * (4 * zz - xx - 3 * yy) * worth[11]
+        gy += -6 * s * y * z * worth[12] + 2 * r * x * y * worth[13] - 2 * t * y * z * worth[14] + 6 * p * x * y * worth[15]
+        gz += q * x * y * worth[10] - 8 * r * y * z * worth[11] + s * (6 * zz - 3 * xx - 3 * yy) * worth[12]
+        gz += -8 * r * x * z * worth[13] + t * (xx - yy) * worth[14]
+    gradient[0], gradient[1], gradient[2] = gx, gy, gz
+
+
+@compiled()
+def project(
+    means: np.ndarray,
+    quats: np.ndarray,
+    log_scales: np.ndarray,
+    logits: np.ndarray,
+    sh: np.ndarray,
+    viewmat: np.ndarray,
+    K: np.ndarray,
+    width: int,
+    height: int,
+    near: float,
+    start: int,
+    stop: int,
+    projected: np.ndarray,  # [gaussians, PROJECTED] float32
+    boxes: np.ndarray,  # [gaussians, 4] int32: columns from, to, rows from, to
+) -> None:
+    """Project the Gaussians from `start` to `stop`. One that is not seen gets an empty box."""
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    margin_x, margin_y = FIELD_OF_VIEW_MARGIN * 0.5 * width / fx, FIELD_OF_VIEW_MARGIN * 0.5 * height / fy
+    camera, point, rotation = np.empty(3), np.empty(3), np.empty((3, 3))
+    basis = np.empty(sh.shape[1])
+    for axis in range(3):
+        camera[axis] = -np.sum(viewmat[:3, axis] * viewmat[:3, 3])
+    for index in range(start, stop):
+        boxes[index, 0], boxes[index, 1], boxes[index, 2], boxes[index, 3] = 0, 0, 0, 0
+        for axis in range(3):
+            point[axis] = viewmat[axis, 3]
+            for other in range(3):
+                point[axis] += viewmat[axis, other] * means[index, other]
+        z = point[2]
+        opacity = 1 / (1 + np.exp(-np.float64(logits[index])))
+        if not (z > near and opacity > MIN_ALPHA):
+            continue
+        across, down = point[0] / z, point[1] / z
+        x, y = fx * across + cx, fy * down + cy
+        across = min(max(across, -cx / fx - margin_x), (width - cx) / fx + margin_x)
+        down = min(max(down, -cy / fy - margin_y), (height - cy) / fy + margin_y)
+        _rotation(quats[index], rotation)
+        xx, xy, yy = DILATION, 0.0, DILATION
+        for column in range(3):
+            scale = np.exp(np.float64(log_scales[index, column]))
+            half_u, half_v = 0.0, 0.0
+            for row in range(3):
+                along = rotation[row, column] * scale
+                half_u += fx / z * (viewmat[0, row] - across * viewmat[2, row]) * along
+                half_v += fy / z * (viewmat[1, row] - down * viewmat[2, row]) * along
+            xx += half_u * half_u
+            xy += half_u * half_v
+            yy += half_v * half_v
+        determinant = xx * yy - xy * xy
+        reach = 2 * (np.log(opacity) - LOG_MIN_ALPHA)
+        half_x, half_y = np.sqrt(reach * xx), np.sqrt(reach * yy)
+        left, right = max(np.ceil(x - half_x - 0.5), 0.0), min(np.floor(x + half_x - 0.5) + 1, float(width))
+        top, bottom = max(np.ceil(y - half_y - 0.5), 0.0), min(np.floor(y + half_y - 0.5) + 1, float(height))
+        if not (left < right and top < bottom):
+            continue
+        boxes[index, 0], boxes[index, 1], boxes[index, 2], boxes[index, 3] = int(left), int(right), int(top), int(bottom)
+        out = projected[index]
+        out[X], out[Y], out[OPACITY], out[DEPTH] = x, y, opacity, z
+        out[CONIC_XX], out[CONIC_XY], out[CONIC_YY] = yy / determinant, -xy / determinant, xx / determinant
+        dx, dy, dz = means[index, 0] - camera[0], means[index, 1] - camera[1], means[index, 2] - camera[2]
+        length = max(np.sqrt(dx * dx + dy * dy + dz * dz), 1e-12)
+        _sh_basis(dx / length, dy / length, dz / length, basis)
+        for channel in range(3):
+            colour = 0.5
+            for coefficient in range(len(basis)):
+                colour += basis[coefficient] * sh[index, coefficient, channel]
+            out[RED + channel] = max(colour, 0.0)
+
+
+@compiled()
+def count_entries(boxes: np.ndarray, offsets: np.ndarray, bands: np.ndarray) -> int:
+    """Fill each Gaussian's first entry [gaussians] and each band's number of entries; the number of all entries."""
+    total = 0
+    for index in range(len(boxes)):
+        offsets[index] = total
+        if boxes[index, 3] > boxes[index, 2]:
+            for band in range(boxes[index, 2] // BAND_ROWS, (boxes[index, 3] - 1) // BAND_ROWS + 1):
+                bands[band] += 1
+                total += 1
+    return total
+
+
+@compiled()
+def list_entries(
+    order: np.ndarray, boxes: np.ndarray, offsets: np.ndarray, starts: np.ndarray, gaussians: np.ndarray, entries: np.ndarray
+) -> None:
+    """Fill the bands' lists, nearest Gaussian first: which Gaussian, and which entry of all."""
+    place = starts.copy()
+    for position in range(len(order)):
+        index = order[position]
+        first = boxes[index, 2] // BAND_ROWS
+        for band in range(first, (boxes[index, 3] - 1) // BAND_ROWS + 1):
+            gaussians[place[band]] = index
+            entries[place[band]] = offsets[index] + band - first
+            place[band] += 1
+
+
+@compiled()
+def _row_span(conic_xx: float, conic_xy: float, conic_yy: float, reach: float, dy: float) -> tuple[float, float]:
+    """The distances from the centre between which alpha can reach MIN_ALPHA on a row at distance dy from it."""
+    inside = conic_xy * conic_xy * dy * dy - conic_xx * (conic_yy * dy * dy - 2 * reach)
+    if inside <= 0:
+        return 1.0, 0.0
+    half, middle = np.sqrt(inside) / conic_xx, -conic_xy * dy / conic_xx
+    return middle - half, middle + half
+
+
+@compiled()
+def composite(
+    gaussians: np.ndarray,
+    start: int,
+    stop: int,
+    projected: np.ndarray,
+    boxes: np.ndarray,
+    band: int,
+    image: np.ndarray,  # [height, width, 3], zeros
+    transmittance: np.ndarray,  # [height, width], ones
+    last: np.ndarray,  # [height, width] int32, -1: the place of each pixel's last Gaussian in the list
+) -> None:
+    """Composite a band's list, front to back. A pixel is closed while its transmittance is negative."""
+    height, width = transmittance.shape
+    first_row, end_row = band * BAND_ROWS, min((band + 1) * BAND_ROWS, height)
+    for place in range(start, stop):
+        index = gaussians[place]
+        values = projected[index]
+        x, y, opacity = values[X], values[Y], values[OPACITY]
+        xx, xy, yy = values[CONIC_XX], values[CONIC_XY], values[CONIC_YY]
+        red, green, blue = values[RED], values[GREEN], values[BLUE]
+        reach = np.log(opacity) - np.float32(LOG_MIN_ALPHA)
+        left, right = boxes[index, 0], boxes[index, 1]
+        for row in range(max(boxes[index, 2], first_row), min(boxes[index, 3], end_row)):
+            dy = np.float32(row) + np.float32(0.5) - y
+            low, high = _row_span(xx, xy, yy, reach, dy)
+            begin = max(int(np.ceil(x + low - np.float32(0.5))), left)
+            end = min(int(np.floor(x + high - np.float32(0.5))) + 1, right)
+            for column in range(begin, end):
+                before = transmittance[row, column]
+                if before < 0:
+                    continue
+                dx = np.float32(column) + np.float32(0.5) - x
+                sigma = np.float32(0.5) * (xx * dx * dx + yy * dy * dy) + xy * dx * dy
+                alpha = min(np.float32(MAX_ALPHA), opacity * np.exp(-sigma))
+                if alpha < np.float32(MIN_ALPHA):
+                    continue
+                after = before * (np.float32(1) - alpha)
+                if after <= np.float32(MIN_TRANSMITTANCE):
+                    transmittance[row, column] = -before
+                    continue
+                weight = alpha * before
+                image[row, column, 0] += weight * red
+                image[row, column, 1] += weight * green
+                image[row, column, 2] += weight * blue
+                transmittance[row, column] = after
+                last[row, column] = place
+    for row in range(first_row, end_row):
+        for column in range(width):
+            transmittance[row, column] = abs(transmittance[row, column])
+
+
+@compiled()
+def composite_backward(
+    gaussians: np.ndarray,
+    entries: np.ndarray,
+    start: int,
+    stop: int,
+    projected: np.ndarray,
+    boxes: np.ndarray,
+    band: int,
+    transmittance: np.ndarray,
+    last: np.ndarray,
+    image_gradient: np.ndarray,  # [height, width, 3]
+    behind: np.ndarray,  # [height, width]: gradient of the transmittance times itself; overwritten
+    through: np.ndarray,  # [height, width]: the transmittance; overwritten
+    gradients: np.ndarray,  # [entries, ENTRY]
+) -> None:
+    """Write the gradients of a band's entries, back to front.
+
+    The transmittance before a Gaussian is that behind it divided by 1 - alpha. `behind` is the part of the loss's
+    derivative that comes from all behind the Gaussian at hand.
+    """
+    height = transmittance.shape[0]
+    first_row, end_row = band * BAND_ROWS, min((band + 1) * BAND_ROWS, height)
+    for place in range(stop - 1, start - 1, -1):
+        index = gaussians[place]
+        values = projected[index]
+        x, y, opacity = values[X], values[Y], values[OPACITY]
+        xx, xy, yy = values[CONIC_XX], values[CONIC_XY], values[CONIC_YY]
+        red, green, blue = values[RED], values[GREEN], values[BLUE]
+        reach = np.log(opacity) - np.float32(LOG_MIN_ALPHA)
+        left, right = boxes[index, 0], boxes[index, 1]
+        zero = np.float32(0)
+        for_x, for_y, for_xx, for_xy, for_yy = zero, zero, zero, zero, zero
+        for_opacity, for_red, for_green, for_blue, total = zero, zero, zero, zero, zero
+        for row in range(max(boxes[index, 2], first_row), min(boxes[index, 3], end_row)):
+            dy = np.float32(row) + np.float32(0.5) - y
+            low, high = _row_span(xx, xy, yy, reach, dy)
+            begin = max(int(np.ceil(x + low - np.float32(0.5))), left)
+            end = min(int(np.floor(x + high - np.float32(0.5))) + 1, right)
+            for column in range(begin, end):
+                if place > last[row, column]:
+                    continue
+                dx = np.float32(column) + np.float32(0.5) - x
+                sigma = np.float32(0.5) * (xx * dx * dx + yy * dy * dy) + xy * dx * dy
+                fall = np.exp(-sigma)
+                alpha = min(np.float32(MAX_ALPHA), opacity * fall)
+                if alpha < np.float32(MIN_ALPHA):
+                    continue
+                open_share = np.float32(1) / (np.float32(1) - alpha)
+                before = through[row, column] * open_share
+                weight = alpha * before
+                down = image_gradient[row, column]
+                for_red += weight * down[0]
+                for_green += weight * down[1]
+                for_blue += weight * down[2]
+                total += weight
+                worth = red * down[0] + green * down[1] + blue * down[2]
+                alpha_gradient = before * worth - behind[row, column] * open_share
+                behind[row, column] += weight * worth
+                through[row, column] = before
+                if opacity * fall >= np.float32(MAX_ALPHA):
+                    continue
+                for_opacity += fall * alpha_gradient
+                sigma_gradient = -alpha * alpha_gradient
+                for_xx += np.float32(0.5) * dx * dx * sigma_gradient
+                for_xy += dx * dy * sigma_gradient
+                for_yy += np.float32(0.5) * dy * dy * sigma_gradient
+                for_x -= (xx * dx + xy * dy) * sigma_gradient
+                for_y -= (yy * dy + xy * dx) * sigma_gradient
+        out = gradients[entries[place]]
+        out[X], out[Y], out[CONIC_XX], out[CONIC_XY], out[CONIC_YY] = for_x, for_y, for_xx, for_xy, for_yy
+        out[OPACITY], out[RED], out[GREEN], out[BLUE], out[WEIGHT] = for_opacity, for_red, for_green, for_blue, total
+
+
+@compiled()
+def _gaussian_gradient(
+    mean: np.ndarray,
+    quat: np.ndarray,
+    log_scale: np.ndarray,
+    sh: np.ndarray,
+    values: np.ndarray,
+    given: np.ndarray,  # [ENTRY] float64
+    viewmat: np.ndarray,
+    K: np.ndarray,
+    width: int,
+    height: int,
+    camera: np.ndarray,
+    work: np.ndarray,  # [4, 3, 3]
+    basis: np.ndarray,  # [2, coefficients]
+    out: np.ndarray,  # [11 + 3 * coefficients]: mean, quat, log scale, logit, SH coefficients
+) -> None:
+    """Fill the gradients of one Gaussian's parameters from those of its projection."""
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    margin_x, margin_y = FIELD_OF_VIEW_MARGIN * 0.5 * width / fx, FIELD_OF_VIEW_MARGIN * 0.5 * height / fy
+    rotation, axes, for_axes = work[0], work[1], work[2]
+    rows, halves = work[3], np.empty((2, 3))
+    px, py, z = viewmat[0, 3], viewmat[1, 3], viewmat[2, 3]
+    for axis in range(3):
+        px += viewmat[0, axis] * mean[axis]
+        py += viewmat[1, axis] * mean[axis]
+        z += viewmat[2, axis] * mean[axis]
+    lowest_x, highest_x = -cx / fx - margin_x, (width - cx) / fx + margin_x
+    lowest_y, highest_y = -cy / fy - margin_y, (height - cy) / fy + margin_y
+    across, down = min(max(px / z, lowest_x), highest_x), min(max(py / z, lowest_y), highest_y)
+    length = _rotation(quat, rotation)
+    for row in range(3):
+        rows[0, row] = fx / z * (viewmat[0, row] - across * viewmat[2, row])
+        rows[1, row] = fy / z * (viewmat[1, row] - down * viewmat[2, row])
+    for column in range(3):
+        scale = np.exp(np.float64(log_scale[column]))
+        halves[0, column], halves[1, column] = 0.0, 0.0
+        for row in range(3):
+            axes[row, column] = rotation[row, column] * scale
+            halves[0, column] += rows[0, row] * axes[row, column]
+            halves[1, column] += rows[1, row] * axes[row, column]
+    # The inverse M of the covariance S: dL/dS = -M (dL/dM) M.
+    a, b, c = np.float64(values[CONIC_XX]), np.float64(values[CONIC_XY]), np.float64(values[CONIC_YY])
+    ga, gb, gc = given[CONIC_XX], given[CONIC_XY], given[CONIC_YY]
+    for_xx = -(a * a * ga + a * b * gb + b * b * gc)
+    for_xy = -2 * (a * b * ga + (a * c + b * b) * gb / 2 + b * c * gc)
+    for_yy = -(b * b * ga + b * c * gb + c * c * gc)
+    for_px, for_py, for_z = given[X] * fx / z, given[Y] * fy / z, 0.0
+    for_z -= (given[X] * fx * px + given[Y] * fy * py) / (z * z)
+    for_across, for_down = 0.0, 0.0
+    for row in range(3):
+        for_u, for_v = 0.0, 0.0
+        for column in range(3):
+            half_u, half_v = halves[0, column], halves[1, column]
+            for_half_u, for_half_v = 2 * for_xx * half_u + for_xy * half_v, 2 * for_yy * half_v + for_xy * half_u
+            for_axes[row, column] = rows[0, row] * for_half_u + rows[1, row] * for_half_v
+            for_u += axes[row, column] * for_half_u
+            for_v += axes[row, column] * for_half_v
+        for_z -= (rows[0, row] * for_u + rows[1, row] * for_v) / z
+        for_across -= fx / z * viewmat[2, row] * for_u
+        for_down -= fy / z * viewmat[2, row] * for_v
+    if lowest_x < px / z < highest_x:
+        for_px += for_across / z
+        for_z -= for_across * px / (z * z)
+    if lowest_y < py / z < highest_y:
+        for_py += for_down / z
+        for_z -= for_down * py / (z * z)
+    for axis in range(3):
+        out[axis] = viewmat[0, axis] * for_px + viewmat[1, axis] * for_py + viewmat[2, axis] * for_z
+    for column in range(3):
+        total = 0.0
+        for row in range(3):
+            total += axes[row, column] * for_axes[row, column]
+        out[7 + column] = total
+        scale = np.exp(np.float64(log_scale[column]))
+        for row in range(3):
+            for_axes[row, column] *= scale
+    g = for_axes
+    w, x, y, q = quat[0] / length, quat[1] / length, quat[2] / length, quat[3] / length
+    gw = 2 * (x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + q * (g[1, 0] - g[0, 1]))
+    gx = 2 * (-2 * x * (g[1, 1] + g[2, 2]) + y * (g[0, 1] + g[1, 0]) + q * (g[0, 2] + g[2, 0]) + w * (g[2, 1] - g[1, 2]))
+    gy = 2 * (x * (g[0, 1] + g[1, 0]) - 2 * y * (g[0, 0] + g[2, 2]) + q * (g[1, 2] + g[2, 1]) + w * (g[0, 2] - g[2, 0]))
+    gz = 2 * (x * (g[0, 2] + g[2, 0]) + y * (g[1, 2] + g[2, 1]) - 2 * q * (g[0, 0] + g[1, 1]) + w * (g[1, 0] - g[0, 1]))
+    along = w * gw + x * gx + y * gy + q * gz
+    out[3], out[4] = (gw - w * along) / length, (gx - x * along) / length
+    out[5], out[6] = (gy - y * along) / length, (gz - q * along) / length
+    opacity = np.float64(values[OPACITY])
+    out[10] = given[OPACITY] * opacity * (1 - opacity)
+    dx, dy, dz = mean[0] - camera[0], mean[1] - camera[1], mean[2] - camera[2]
+    distance = max(np.sqrt(dx * dx + dy * dy + dz * dz), 1e-12)
+    dx, dy, dz = dx / distance, dy / distance, dz / distance
+    coefficients = len(sh)
+    _sh_basis(dx, dy, dz, basis[0])
+    for coefficient in range(coefficients):
+        basis[1, coefficient] = 0.0
+    for channel in range(3):
+        for_colour = given[RED + channel] if values[RED + channel] > 0 else 0.0
+        for coefficient in range(coefficients):
+            out[11 + 3 * coefficient + channel] = basis[0, coefficient] * for_colour
+            basis[1, coefficient] += sh[coefficient, channel] * for_colour
+    if coefficients > 1:
+        turn = rows[2]
+        _sh_gradient(dx, dy, dz, basis[1], turn)
+        radial = dx * turn[0] + dy * turn[1] + dz * turn[2]
+        out[0] += (turn[0] - dx * radial) / distance
+        out[1] += (turn[1] - dy * radial) / distance
+        out[2] += (turn[2] - dz * radial) / distance
+
+
+@compiled()
+def _sum_entries(index: int, boxes: np.ndarray, offsets: np.ndarray, gradients: np.ndarray, total: np.ndarray) -> None:
+    total[:] = 0.0
+    first, end = offsets[index], offsets[index] + (boxes[index, 3] - 1) // BAND_ROWS - boxes[index, 2] // BAND_ROWS + 1
+    for entry in range(first, end):
+        for column in range(ENTRY):
+            total[column] += gradients[entry, column]
+
+
+@compiled()
+def parameter_gradients(
+    means: np.ndarray,
+    quats: np.ndarray,
+    log_scales: np.ndarray,
+    sh: np.ndarray,
+    viewmat: np.ndarray,
+    K: np.ndarray,
+    width: int,
+    height: int,
+    start: int,
+    stop: int,
+    projected: np.ndarray,
+    boxes: np.ndarray,
+    offsets: np.ndarray,
+    gradients: np.ndarray,
+    out: np.ndarray,  # [gaussians, 11 + 3 * coefficients]
+) -> None:
+    """Fill the gradients of the parameters of the Gaussians from `start` to `stop`; zero for those not seen."""
+    camera, work, given = np.empty(3), np.empty((4, 3, 3)), np.empty(ENTRY)
+    basis = np.empty((2, sh.shape[1]))
+    for axis in range(3):
+        camera[axis] = -np.sum(viewmat[:3, axis] * viewmat[:3, 3])
+    for index in range(start, stop):
+        if boxes[index, 3] <= boxes[index, 2]:
+            out[index] = 0.0
+            continue
+        _sum_entries(index, boxes, offsets, gradients, given)
+        _gaussian_gradient(
+            means[index], quats[index], log_scales[index], sh[index], projected[index], given,
+            viewmat, K, width, height, camera, work, basis, out[index],
+        )  # fmt: skip
+
+
+@compiled()
+def adam_step(
+    means: np.ndarray,
+    quats: np.ndarray,
+    log_scales: np.ndarray,
+    logits: np.ndarray,
+    sh: np.ndarray,
+    viewmat: np.ndarray,
+    K: np.ndarray,
+    width: int,
+    height: int,
+    start: int,
+    stop: int,
+    projected: np.ndarray,
+    boxes: np.ndarray,
+    offsets: np.ndarray,
+    gradients: np.ndarray,
+    moments: np.ndarray,  # [gaussians, 2, 11 + 3 * coefficients] float32
+    lr: np.ndarray,  # [11 + 3 * coefficients]
+    beta_1: float,
+    beta_2: float,
+    epsilon: float,
+    correction_1: float,
+    correction_2: float,
+    opacity_weight: float,
+    scale_weight: float,
+    contributions: np.ndarray,  # [gaussians] float32: added to
+) -> None:
+    """One step of Adam on the Gaussians that this view sees (selective Adam); no gradient is stored."""
+    camera, work, given = np.empty(3), np.empty((4, 3, 3)), np.empty(ENTRY)
+    basis = np.empty((2, sh.shape[1]))
+    gradient = np.empty(11 + 3 * sh.shape[1])
+    for axis in range(3):
+        camera[axis] = -np.sum(viewmat[:3, axis] * viewmat[:3, 3])
+    for index in range(start, stop):
+        if boxes[index, 3] <= boxes[index, 2]:
+            continue
+        _sum_entries(index, boxes, offsets, gradients, given)
+        contributions[index] += given[WEIGHT]
+        if given[WEIGHT] == 0.0:
+            continue
+        _gaussian_gradient(
+            means[index], quats[index], log_scales[index], sh[index], projected[index], given,
+            viewmat, K, width, height, camera, work, basis, gradient,
+        )  # fmt: skip
+        opacity = np.float64(projected[index, OPACITY])
+        gradient[10] += opacity_weight * opacity * (1 - opacity)
+        for axis in range(3):
+            gradient[7 + axis] += scale_weight * np.exp(np.float64(log_scales[index, axis]))
+        first, second = moments[index, 0], moments[index, 1]
+        for column in range(len(gradient)):
+            g = np.float32(gradient[column])
+            first[column] = np.float32(beta_1) * first[column] + np.float32(1 - beta_1) * g
+            second[column] = np.float32(beta_2) * second[column] + np.float32(1 - beta_2) * g * g
+            root = np.sqrt(second[column] * np.float32(correction_2)) + np.float32(epsilon)
+            gradient[column] = lr[column] * first[column] * np.float32(correction_1) / root
+        for axis in range(3):
+            means[index, axis] -= gradient[axis]
+            log_scales[index, axis] -= gradient[7 + axis]
+        for axis in range(4):
+            quats[index, axis] -= gradient[3 + axis]
+        logits[index] -= gradient[10]
+        for coefficient in range(sh.shape[1]):
+            for channel in range(3):
+                sh[index, coefficient, channel] -= gradient[11 + 3 * coefficient + channel]

@@ -1,0 +1,151 @@
+"""Rendering with gradients: the compiled kernels on the machine's cores."""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from . import kernels
+
+NEAR = 0.01  # world units
+MOST_THREADS = 8
+BLOCK = 1 << 13  # Gaussians of one task
+BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15  # of Adam, as 3DGS has them
+
+
+@dataclass(eq=False)
+class Parameters:
+    """What is optimised: means, quats, log scales, opacity logits and SH coefficients, contiguous float32 arrays."""
+
+    means: np.ndarray
+    quats: np.ndarray
+    log_scales: np.ndarray
+    logits: np.ndarray
+    sh: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def columns(self) -> int:
+        """Numbers of one Gaussian."""
+        return 11 + 3 * self.sh.shape[1]
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """A view to render: viewmat is world-to-camera [4, 4], K in pixels [3, 3], both float64."""
+
+    viewmat: np.ndarray
+    K: np.ndarray
+    width: int
+    height: int
+
+
+@dataclass(eq=False)
+class Pass:
+    """A forward pass, with what the backward pass needs of it."""
+
+    rgb: np.ndarray
+    transmittance: np.ndarray
+    last: np.ndarray
+    projected: np.ndarray
+    boxes: np.ndarray
+    offsets: np.ndarray
+    starts: np.ndarray
+    gaussians: np.ndarray
+    entries: np.ndarray
+    target: Target
+
+
+@dataclass(eq=False)
+class GradientRasterizer:
+    """Renders parameters, and leads gradients of the image back to them."""
+
+    parameters: Parameters
+    _pool: ThreadPoolExecutor = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._pool = ThreadPoolExecutor(min(MOST_THREADS, os.cpu_count() or 1))
+        count = len(self.parameters)
+        self._projected = np.zeros((count, kernels.PROJECTED), np.float32)
+        self._boxes = np.zeros((count, 4), np.int32)
+        self._offsets = np.zeros(count, np.int64)
+
+    def forward(self, target: Target) -> Pass:
+        """Render a view. The pass is valid until the next one."""
+        p, width, height = self.parameters, target.width, target.height
+        projected, boxes, offsets = self._projected, self._boxes, self._offsets
+
+        def project(start: int, stop: int) -> None:
+            kernels.project(
+                p.means, p.quats, p.log_scales, p.logits, p.sh, target.viewmat, target.K,
+                width, height, NEAR, start, stop, projected, boxes,
+            )  # fmt: skip
+
+        self._over_gaussians(project)
+        bands = np.zeros(-(-height // kernels.BAND_ROWS), np.int64)
+        total = kernels.count_entries(boxes, offsets, bands)
+        starts = np.concatenate([[0], np.cumsum(bands)])
+        seen = np.flatnonzero(boxes[:, 3] > boxes[:, 2])
+        order = seen[np.argsort(projected[seen, kernels.DEPTH], kind="stable")]
+        gaussians, entries = np.empty(total, np.int32), np.empty(total, np.int64)
+        kernels.list_entries(order, boxes, offsets, starts, gaussians, entries)
+        rgb = np.zeros((height, width, 3), np.float32)
+        transmittance, last = np.ones((height, width), np.float32), np.full((height, width), -1, np.int32)
+
+        def composite(band: int) -> None:
+            kernels.composite(
+                gaussians, starts[band], starts[band + 1], projected, boxes, band, rgb, transmittance, last
+            )
+
+        self._over_bands(composite, len(bands))
+        return Pass(rgb, transmittance, last, projected, boxes, offsets, starts, gaussians, entries, target)
+
+    def backward(self, done: Pass, for_rgb: np.ndarray, for_transmittance: np.ndarray | None = None) -> np.ndarray:
+        """Gradients of the entries of a pass from those of its rgb and transmittance."""
+        behind = np.zeros_like(done.transmittance) if for_transmittance is None else for_transmittance * done.transmittance
+        through, gradients = done.transmittance.copy(), np.zeros((len(done.entries), kernels.ENTRY), np.float32)
+        for_rgb = np.ascontiguousarray(for_rgb, np.float32)
+
+        def composite_backward(band: int) -> None:
+            kernels.composite_backward(
+                done.gaussians, done.entries, done.starts[band], done.starts[band + 1], done.projected, done.boxes, band,
+                done.transmittance, done.last, for_rgb, behind, through, gradients,
+            )  # fmt: skip
+
+        self._over_bands(composite_backward, len(done.starts) - 1)
+        return gradients
+
+    def step(
+        self,
+        done: Pass,
+        gradients: np.ndarray,
+        moments: np.ndarray,
+        lr: np.ndarray,
+        count: int,
+        opacity_weight: float,
+        scale_weight: float,
+        contributions: np.ndarray,
+    ) -> None:
+        """One step of Adam, the `count`-th (from 1), on the Gaussians that the pass saw."""
+        p, target = self.parameters, done.target
+        corrections = 1 / (1 - BETA_1**count), 1 / (1 - BETA_2**count)
+
+        def adam_step(start: int, stop: int) -> None:
+            kernels.adam_step(
+                p.means, p.quats, p.log_scales, p.logits, p.sh, target.viewmat, target.K, target.width, target.height,
+                start, stop, done.projected, done.boxes, done.offsets, gradients, moments, lr,
+                BETA_1, BETA_2, EPSILON, *corrections, opacity_weight, scale_weight, contributions,
+            )  # fmt: skip
+
+        self._over_gaussians(adam_step)
+
+    def _over_gaussians(self, task: Callable[[int, int], None]) -> None:
+        count = len(self.parameters)
+        list(self._pool.map(lambda start: task(start, min(start + BLOCK, count)), range(0, count, BLOCK)))
+
+    def _over_bands(self, task: Callable[[int], None], bands: int) -> None:
+        list(self._pool.map(task, range(bands)))
