@@ -13,7 +13,7 @@ import numba
 import numpy as np
 
 from ..geometry.sh import SH_0, SH_1, SH_2, SH_3
-from ..rendering.types import DILATION, FIELD_OF_VIEW_MARGIN, MAX_ALPHA, MIN_ALPHA
+from ..rendering.types import EPS2D, FOV_MARGIN, MAX_ALPHA, MIN_ALPHA
 
 BAND_ROWS = 16
 MIN_TRANSMITTANCE = 1e-4
@@ -78,7 +78,12 @@ def _sh_gradient(x: float, y: float, z: float, worth: np.ndarray, gradient: np.n
         gx += -6 * p * x * y * worth[9] + q * y * z * worth[10] + 2 * r * x * y * worth[11] - 6 * s * x * z * worth[12]
         gx += -r * (4 * zz - 3 * xx - yy) * worth[13] + 2 * t * x * z * worth[14] - 3 * p * (xx - yy) * worth[15]
         gy += -3 * p * (xx - yy) * worth[9] + q * x * z * worth[10] - r * (4 * zz - xx - 3 * yy) * worth[11]
-        gy += -6 * s * y * z * worth[12] + 2 * r * x * y * worth[13] - 2 * t * y * z * worth[14] + 6 * p * x * y * worth[15]
+        gy += (
+            -6 * s * y * z * worth[12]
+            + 2 * r * x * y * worth[13]
+            - 2 * t * y * z * worth[14]
+            + 6 * p * x * y * worth[15]
+        )
         gz += q * x * y * worth[10] - 8 * r * y * z * worth[11] + s * (6 * zz - 3 * xx - 3 * yy) * worth[12]
         gz += -8 * r * x * z * worth[13] + t * (xx - yy) * worth[14]
     gradient[0], gradient[1], gradient[2] = gx, gy, gz
@@ -103,7 +108,7 @@ def project(
 ) -> None:
     """Project the Gaussians from `start` to `stop`. One that is not seen gets an empty box."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    margin_x, margin_y = FIELD_OF_VIEW_MARGIN * 0.5 * width / fx, FIELD_OF_VIEW_MARGIN * 0.5 * height / fy
+    margin_x, margin_y = FOV_MARGIN * 0.5 * width / fx, FOV_MARGIN * 0.5 * height / fy
     camera, point, rotation = np.empty(3), np.empty(3), np.empty((3, 3))
     basis = np.empty(sh.shape[1])
     for axis in range(3):
@@ -123,7 +128,7 @@ def project(
         across = min(max(across, -cx / fx - margin_x), (width - cx) / fx + margin_x)
         down = min(max(down, -cy / fy - margin_y), (height - cy) / fy + margin_y)
         _rotation(quats[index], rotation)
-        xx, xy, yy = DILATION, 0.0, DILATION
+        xx, xy, yy = EPS2D, 0.0, EPS2D
         for column in range(3):
             scale = np.exp(np.float64(log_scales[index, column]))
             half_u, half_v = 0.0, 0.0
@@ -141,7 +146,12 @@ def project(
         top, bottom = max(np.ceil(y - half_y - 0.5), 0.0), min(np.floor(y + half_y - 0.5) + 1, float(height))
         if not (left < right and top < bottom):
             continue
-        boxes[index, 0], boxes[index, 1], boxes[index, 2], boxes[index, 3] = int(left), int(right), int(top), int(bottom)
+        boxes[index, 0], boxes[index, 1], boxes[index, 2], boxes[index, 3] = (
+            int(left),
+            int(right),
+            int(top),
+            int(bottom),
+        )
         out = projected[index]
         out[X], out[Y], out[OPACITY], out[DEPTH] = x, y, opacity, z
         out[CONIC_XX], out[CONIC_XY], out[CONIC_YY] = yy / determinant, -xy / determinant, xx / determinant
@@ -170,7 +180,12 @@ def count_entries(boxes: np.ndarray, offsets: np.ndarray, bands: np.ndarray) -> 
 
 @compiled()
 def list_entries(
-    order: np.ndarray, boxes: np.ndarray, offsets: np.ndarray, starts: np.ndarray, gaussians: np.ndarray, entries: np.ndarray
+    order: np.ndarray,
+    boxes: np.ndarray,
+    offsets: np.ndarray,
+    starts: np.ndarray,
+    gaussians: np.ndarray,
+    entries: np.ndarray,
 ) -> None:
     """Fill the bands' lists, nearest Gaussian first: which Gaussian, and which entry of all."""
     place = starts.copy()
@@ -338,7 +353,7 @@ def _gaussian_gradient(
 ) -> None:
     """Fill the gradients of one Gaussian's parameters from those of its projection."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    margin_x, margin_y = FIELD_OF_VIEW_MARGIN * 0.5 * width / fx, FIELD_OF_VIEW_MARGIN * 0.5 * height / fy
+    margin_x, margin_y = FOV_MARGIN * 0.5 * width / fx, FOV_MARGIN * 0.5 * height / fy
     rotation, axes, for_axes = work[0], work[1], work[2]
     rows, halves = work[3], np.empty((2, 3))
     px, py, z = viewmat[0, 3], viewmat[1, 3], viewmat[2, 3]
@@ -399,7 +414,9 @@ def _gaussian_gradient(
     g = for_axes
     w, x, y, q = quat[0] / length, quat[1] / length, quat[2] / length, quat[3] / length
     gw = 2 * (x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + q * (g[1, 0] - g[0, 1]))
-    gx = 2 * (-2 * x * (g[1, 1] + g[2, 2]) + y * (g[0, 1] + g[1, 0]) + q * (g[0, 2] + g[2, 0]) + w * (g[2, 1] - g[1, 2]))
+    gx = 2 * (
+        -2 * x * (g[1, 1] + g[2, 2]) + y * (g[0, 1] + g[1, 0]) + q * (g[0, 2] + g[2, 0]) + w * (g[2, 1] - g[1, 2])
+    )
     gy = 2 * (x * (g[0, 1] + g[1, 0]) - 2 * y * (g[0, 0] + g[2, 2]) + q * (g[1, 2] + g[2, 1]) + w * (g[0, 2] - g[2, 0]))
     gz = 2 * (x * (g[0, 2] + g[2, 0]) + y * (g[1, 2] + g[2, 1]) - 2 * q * (g[0, 0] + g[1, 1]) + w * (g[1, 0] - g[0, 1]))
     along = w * gw + x * gx + y * gy + q * gz

@@ -17,7 +17,7 @@ BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15  # of Adam, as 3DGS has them
 
 @dataclass(eq=False)
 class Parameters:
-    """What is optimised: means, quats, log scales, opacity logits and SH coefficients, contiguous float32 arrays."""
+    """What is optimised: means, quats, log scales, opacity logits and SH coefficients, contiguous arrays of one float type."""
 
     means: np.ndarray
     quats: np.ndarray
@@ -70,7 +70,7 @@ class GradientRasterizer:
     def __post_init__(self) -> None:
         self._pool = ThreadPoolExecutor(min(MOST_THREADS, os.cpu_count() or 1))
         count = len(self.parameters)
-        self._projected = np.zeros((count, kernels.PROJECTED), np.float32)
+        self._projected = np.zeros((count, kernels.PROJECTED), self.parameters.means.dtype)
         self._boxes = np.zeros((count, 4), np.int32)
         self._offsets = np.zeros(count, np.int64)
 
@@ -93,8 +93,9 @@ class GradientRasterizer:
         order = seen[np.argsort(projected[seen, kernels.DEPTH], kind="stable")]
         gaussians, entries = np.empty(total, np.int32), np.empty(total, np.int64)
         kernels.list_entries(order, boxes, offsets, starts, gaussians, entries)
-        rgb = np.zeros((height, width, 3), np.float32)
-        transmittance, last = np.ones((height, width), np.float32), np.full((height, width), -1, np.int32)
+        dtype = projected.dtype
+        rgb, transmittance = np.zeros((height, width, 3), dtype), np.ones((height, width), dtype)
+        last = np.full((height, width), -1, np.int32)
 
         def composite(band: int) -> None:
             kernels.composite(
@@ -106,9 +107,12 @@ class GradientRasterizer:
 
     def backward(self, done: Pass, for_rgb: np.ndarray, for_transmittance: np.ndarray | None = None) -> np.ndarray:
         """Gradients of the entries of a pass from those of its rgb and transmittance."""
-        behind = np.zeros_like(done.transmittance) if for_transmittance is None else for_transmittance * done.transmittance
-        through, gradients = done.transmittance.copy(), np.zeros((len(done.entries), kernels.ENTRY), np.float32)
-        for_rgb = np.ascontiguousarray(for_rgb, np.float32)
+        behind = (
+            np.zeros_like(done.transmittance) if for_transmittance is None else for_transmittance * done.transmittance
+        )
+        dtype = done.rgb.dtype
+        through, gradients = done.transmittance.copy(), np.zeros((len(done.entries), kernels.ENTRY), dtype)
+        for_rgb = np.ascontiguousarray(for_rgb, dtype)
 
         def composite_backward(band: int) -> None:
             kernels.composite_backward(
@@ -118,6 +122,20 @@ class GradientRasterizer:
 
         self._over_bands(composite_backward, len(done.starts) - 1)
         return gradients
+
+    def parameter_gradients(self, done: Pass, gradients: np.ndarray) -> np.ndarray:
+        """Gradients of the parameters from those of the entries, float64 [gaussians, columns]."""
+        p, target = self.parameters, done.target
+        out = np.zeros((len(p), p.columns))
+
+        def differentiate(start: int, stop: int) -> None:
+            kernels.parameter_gradients(
+                p.means, p.quats, p.log_scales, p.sh, target.viewmat, target.K, target.width, target.height,
+                start, stop, done.projected, done.boxes, done.offsets, gradients, out,
+            )  # fmt: skip
+
+        self._over_gaussians(differentiate)
+        return out
 
     def step(
         self,

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..splats.gaussians import Gaussians
-from . import kernels
 from .losses import photometric_loss
 from .rasterizer import GradientRasterizer, Parameters, Target
 
@@ -76,7 +75,7 @@ class Refined:
 def refine(
     gaussians: Gaussians,
     views: Sequence[PosedImage],
-    options: RefinementOptions = RefinementOptions(),  # noqa: B008
+    options: RefinementOptions = RefinementOptions(),
     report: Callable[[int, float], bool] | None = None,
 ) -> Refined:
     """Fit Gaussians to posed images by Adam on (1 - w) L1 + w (1 - SSIM), one view a step.
