@@ -26,6 +26,7 @@ COMMANDS = {
     "export": SubCommand("...export.cli", "export", "A checkpoint to ONNX, verified against PyTorch."),
     "view": SubCommand(".view", "view", "Look at a splat file in the browser."),
     "render": SubCommand(".render", "render", "A splat file to images or a video."),
+    "refine": SubCommand(".refine", "refine", "Fit a splat file to the images of its scene."),
     "convert": SubCommand(".convert", "convert", "A splat file to another format."),
     "cameras": SubCommand(".cameras", "app", "Estimate cameras, or convert them between formats."),
     "eval": SubCommand("...tools.evaluation.cli", "app", "Novel-view and depth metrics of a model."),

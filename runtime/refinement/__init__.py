@@ -1,1 +1,1 @@
-"""Refinement of Gaussians on the images that they were predicted from: a differentiable rasteriser and its optimiser."""
+"""Refinement of Gaussians on posed images: a differentiable rasteriser and its optimiser."""

@@ -1,9 +1,9 @@
 """The differentiable rasteriser compiled by numba: projection, compositing, and the way back to every parameter.
 
-The forward arithmetic is that of `rendering` (EWA splatting, Zwicker et al. 2001, with the constants of gsplat). The image
-is divided into bands of rows. Each band has the list of Gaussians that reach it, nearest first; a Gaussian in a band is an
-entry. The backward pass writes one row of gradients for each entry, and the Gaussian sums its entries in a fixed order:
-no two threads write to one place, and the result does not depend on the number of threads.
+The forward arithmetic is that of `rendering` (EWA splatting, Zwicker et al. 2001, with the constants of gsplat). The
+image is divided into bands of rows. Each band has the list of Gaussians that reach it, nearest first; a Gaussian in a
+band is an entry. The backward pass writes one row of gradients for each entry, and each Gaussian sums its entries in a
+fixed order: no two threads write to one place, and the result does not depend on the number of threads.
 """
 
 import functools
@@ -12,8 +12,9 @@ from math import log
 import numba
 import numpy as np
 
+from ..geometry.projection import EPS2D, FOV_MARGIN
 from ..geometry.sh import SH_0, SH_1, SH_2, SH_3
-from ..rendering.types import EPS2D, FOV_MARGIN, MAX_ALPHA, MIN_ALPHA
+from ..rendering.types import MAX_ALPHA, MIN_ALPHA
 
 BAND_ROWS = 16
 MIN_TRANSMITTANCE = 1e-4
@@ -512,9 +513,6 @@ def adam_step(
     epsilon: float,
     correction_1: float,
     correction_2: float,
-    opacity_weight: float,
-    scale_weight: float,
-    contributions: np.ndarray,  # [gaussians] float32: added to
 ) -> None:
     """One step of Adam on the Gaussians that this view sees (selective Adam); no gradient is stored."""
     camera, work, given = np.empty(3), np.empty((4, 3, 3)), np.empty(ENTRY)
@@ -526,17 +524,12 @@ def adam_step(
         if boxes[index, 3] <= boxes[index, 2]:
             continue
         _sum_entries(index, boxes, offsets, gradients, given)
-        contributions[index] += given[WEIGHT]
         if given[WEIGHT] == 0.0:
             continue
         _gaussian_gradient(
             means[index], quats[index], log_scales[index], sh[index], projected[index], given,
             viewmat, K, width, height, camera, work, basis, gradient,
         )  # fmt: skip
-        opacity = np.float64(projected[index, OPACITY])
-        gradient[10] += opacity_weight * opacity * (1 - opacity)
-        for axis in range(3):
-            gradient[7 + axis] += scale_weight * np.exp(np.float64(log_scales[index, axis]))
         first, second = moments[index, 0], moments[index, 1]
         for column in range(len(gradient)):
             g = np.float32(gradient[column])

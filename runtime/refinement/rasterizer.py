@@ -17,7 +17,7 @@ BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15  # of Adam, as 3DGS has them
 
 @dataclass(eq=False)
 class Parameters:
-    """What is optimised: means, quats, log scales, opacity logits and SH coefficients, contiguous arrays of one float type."""
+    """What is optimised, as contiguous arrays of one float type: log scales, and logits of the opacities."""
 
     means: np.ndarray
     quats: np.ndarray
@@ -115,8 +115,9 @@ class GradientRasterizer:
         for_rgb = np.ascontiguousarray(for_rgb, dtype)
 
         def composite_backward(band: int) -> None:
+            start, stop = done.starts[band], done.starts[band + 1]
             kernels.composite_backward(
-                done.gaussians, done.entries, done.starts[band], done.starts[band + 1], done.projected, done.boxes, band,
+                done.gaussians, done.entries, start, stop, done.projected, done.boxes, band,
                 done.transmittance, done.last, for_rgb, behind, through, gradients,
             )  # fmt: skip
 
@@ -144,9 +145,6 @@ class GradientRasterizer:
         moments: np.ndarray,
         lr: np.ndarray,
         count: int,
-        opacity_weight: float,
-        scale_weight: float,
-        contributions: np.ndarray,
     ) -> None:
         """One step of Adam, the `count`-th (from 1), on the Gaussians that the pass saw."""
         p, target = self.parameters, done.target
@@ -156,7 +154,7 @@ class GradientRasterizer:
             kernels.adam_step(
                 p.means, p.quats, p.log_scales, p.logits, p.sh, target.viewmat, target.K, target.width, target.height,
                 start, stop, done.projected, done.boxes, done.offsets, gradients, moments, lr,
-                BETA_1, BETA_2, EPSILON, *corrections, opacity_weight, scale_weight, contributions,
+                BETA_1, BETA_2, EPSILON, *corrections,
             )  # fmt: skip
 
         self._over_gaussians(adam_step)

@@ -1,29 +1,35 @@
-"""Per-scene refinement: Gaussians fitted to the images that they were predicted from (3D Gaussian splatting, Kerbl et al.
-2023), starting from the feed-forward result, for some dozens of steps."""
+"""Per-scene refinement: Gaussians fitted to posed images, as in 3D Gaussian splatting (Kerbl et al. 2023).
 
-import time
+It starts from a finished scene, such as a feed-forward prediction, and makes some dozens of steps.
+"""
+
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ..splats.gaussians import Gaussians
+from ..system.progress import progress
 from .losses import photometric_loss
 from .rasterizer import GradientRasterizer, Parameters, Target
+
+MAX_TRANSMITTANCE = 0.5  # of a pixel that counts as covered
 
 
 @dataclass(frozen=True)
 class RefinementOptions:
     """What a refinement does.
 
-    steps: of the optimiser, one view each. seconds: stops it earlier. max_opacity, scale_factor: the start, since
-    saturated opacities have no gradient. lr_*: learning rates of Adam; that of the means is in units of the median depth.
+    steps: of the optimiser, one view each. seed: of the order of the views.
+    max_opacity, scale_factor: limit the opacities and enlarge the scales at the start: saturated opacities have almost
+    no gradient, and lower ones leave gaps between splats.
+    ssim_weight: of 1 - SSIM against L1. lr_*: learning rates of Adam; of the means, relative to the median depth.
+    final_lr: what is left of the learning rates at the end, as they decay exponentially.
     """
 
     steps: int = 120
-    seconds: float | None = None
     seed: int = 0
-    max_opacity: float = 0.6
+    max_opacity: float = 0.8
     scale_factor: float = 1.1
     ssim_weight: float = 0.2
     lr_means: float = 2e-4
@@ -32,10 +38,7 @@ class RefinementOptions:
     lr_opacities: float = 5e-2
     lr_dc: float = 5e-3
     lr_sh: float = 1e-3
-    lr_exposure: float = 0.0
-    opacity_weight: float = 0.0
-    scale_weight: float = 0.0
-    final_lr: float = 0.1  # share of the learning rates that is left at the end
+    final_lr: float = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +66,6 @@ class Refined:
 
     gaussians: Gaussians
     psnr: list[float] = field(default_factory=list)
-    exposure: np.ndarray | None = None
-    contributions: np.ndarray | None = None
 
     @property
     def steps(self) -> int:
@@ -81,32 +82,33 @@ def refine(
     """Fit Gaussians to posed images by Adam on (1 - w) L1 + w (1 - SSIM), one view a step.
 
     report: is told the step and the view's PSNR, and stops the refinement by returning False. The result depends on
-    the seed alone, not on the number of threads.
+    the seed alone, not on the number of threads. Pixels that the scene does not cover at the start have no weight, so
+    that no Gaussian is stretched to fill them.
     """
     parameters = _parameters(gaussians, options)
     rasterizer = GradientRasterizer(parameters)
     lr = _learning_rates(parameters, _median_depth(parameters, views), options)
     moments = np.zeros((len(parameters), 2, parameters.columns), np.float32)
-    contributions = np.zeros(len(parameters), np.float32)
-    exposure = _Exposure(len(views), options.lr_exposure)
     order = _view_order(len(views), options)
-    started, psnr = time.perf_counter(), []
-    for step in range(options.steps):
-        if options.seconds is not None and time.perf_counter() - started > options.seconds:
-            break
-        view = order[step]
-        done = rasterizer.forward(views[view].target)
-        shown = exposure.apply(view, done.rgb)
-        loss = photometric_loss(shown, views[view].image, views[view].weights, options.ssim_weight)
-        psnr.append(_psnr(shown, views[view]))
-        gradients = rasterizer.backward(done, exposure.backward(view, done.rgb, loss.gradient))
+    views = [_covered(rasterizer, view) for view in progress(views, "finding what the scene covers")]
+    psnr: list[float] = []
+    for step in progress(range(options.steps), "refining"):
+        view = views[order[step]]
+        done = rasterizer.forward(view.target)
+        loss = photometric_loss(done.rgb, view.image, view.weights, options.ssim_weight)
+        psnr.append(_psnr(done.rgb, view))
+        gradients = rasterizer.backward(done, loss.gradient)
         decay = options.final_lr ** (step / max(options.steps - 1, 1))
-        rasterizer.step(
-            done, gradients, moments, lr * decay, step + 1, options.opacity_weight, options.scale_weight, contributions
-        )
+        rasterizer.step(done, gradients, moments, lr * decay, step + 1)
         if report is not None and not report(step, psnr[-1]):
             break
-    return Refined(_gaussians(parameters), psnr, exposure.values, contributions)
+    return Refined(_gaussians(parameters), psnr)
+
+
+def _covered(rasterizer: GradientRasterizer, view: PosedImage) -> PosedImage:
+    """The view with weight 0 where less than half of the light is stopped by the scene."""
+    covered = rasterizer.forward(view.target).transmittance < MAX_TRANSMITTANCE
+    return replace(view, weights=view.weights * covered[..., None])
 
 
 def _parameters(gaussians: Gaussians, options: RefinementOptions) -> Parameters:
@@ -124,10 +126,10 @@ def _gaussians(parameters: Parameters) -> Gaussians:
 
 
 def _median_depth(parameters: Parameters, views: Sequence[PosedImage]) -> float:
-    depths = []
+    depths: list[float] = []
     for view in views:
         z = parameters.means @ view.viewmat[2, :3].astype(np.float32) + np.float32(view.viewmat[2, 3])
-        depths.append(np.median(z[z > 0]) if (z > 0).any() else 1.0)
+        depths.append(float(np.median(z[z > 0])) if (z > 0).any() else 1.0)
     return float(np.median(depths))
 
 
@@ -149,31 +151,3 @@ def _psnr(image: np.ndarray, view: PosedImage) -> float:
     weights = view.weights
     error = float((np.square(image - view.image) * weights).sum()) / max(3 * float(weights.sum()), 1.0)
     return -10 * float(np.log10(error + 1e-12))
-
-
-class _Exposure:
-    """A gain and an offset for each view and channel, [views, 2, 3], optimised by Adam."""
-
-    def __init__(self, views: int, lr: float) -> None:
-        self.lr = lr
-        self.values = np.zeros((views, 2, 3), np.float32)
-        self.values[:, 0] = 1
-        self._moments = np.zeros((2, views, 2, 3))
-        self._counts = np.zeros(views, int)
-
-    def apply(self, view: int, rgb: np.ndarray) -> np.ndarray:
-        return rgb if self.lr == 0 else rgb * self.values[view, 0] + self.values[view, 1]
-
-    def backward(self, view: int, rgb: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-        """Lead the gradient of the exposed image back to the rendered one, and make a step."""
-        if self.lr == 0:
-            return gradient
-        through = gradient * self.values[view, 0]
-        given = np.stack([(gradient * rgb).sum(axis=(0, 1)), gradient.sum(axis=(0, 1))])
-        self._counts[view] += 1
-        first, second, count = self._moments[0, view], self._moments[1, view], self._counts[view]
-        first += 0.1 * (given - first)
-        second += 0.001 * (given**2 - second)
-        self.values[view] -= self.lr * (first / (1 - 0.9**count)) / (np.sqrt(second / (1 - 0.999**count)) + 1e-15)
-        self.values /= np.append(self.values[:, 0].mean(axis=0), np.ones(3)).reshape(2, 3)  # the mean gain stays 1
-        return through

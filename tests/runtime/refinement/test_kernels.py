@@ -1,4 +1,4 @@
-"""The compiled kernels of refinement: gsplat's reference images, and gradients against PyTorch and finite differences."""
+"""The kernels of refinement: gsplat's reference images, gradients against PyTorch and finite differences."""
 
 from pathlib import Path
 

@@ -1,0 +1,129 @@
+"""The command `idesplat refine`: a splat file fitted to the images of its scene."""
+
+import signal
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ..cameras.io import CameraFormat
+from ..errors import InputError
+from .options import Cameras, CamerasFormat, Config, Images, Overwrite, Quiet, Verbose
+from .outputs import command, outputs
+from .reporting import note
+from .terminal import run, say
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from ..refinement.refine import PosedImage, Refined, RefinementOptions
+    from ..splats.gaussians import Gaussians
+
+STEPS_PER_VIEW = 15
+MAX_STEPS = 100_000
+
+
+@command("idesplat refine")
+def refine(
+    scene: Annotated[Path, typer.Argument(help="Splat file of any format.", show_default=False)],
+    images: Images = None,
+    cameras: Cameras = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Splat file to write, of any format.", show_default=False)
+    ] = None,
+    camera_format: CamerasFormat = None,
+    steps: Annotated[
+        int | None,
+        typer.Option(
+            help=f"Steps of the optimiser, one image each; else {STEPS_PER_VIEW} for each image.", min=1, max=MAX_STEPS
+        ),
+    ] = None,
+    max_side: Annotated[int, typer.Option(help="Longer side of the images, in pixels.", min=16, max=4096)] = 512,
+    seed: Annotated[int, typer.Option(help="Of the order of the images.", min=0)] = 0,
+    overwrite: Overwrite = False,
+    config: Config = None,
+    verbose: Verbose = 0,
+    quiet: Quiet = False,
+) -> None:
+    """Fit the Gaussians of a splat file to posed images of its scene (needs the extra `fast`).
+
+    Parts of the images that the scene does not cover are left as they are.
+
+    Ctrl-C ends the refinement and writes what it has reached.
+    """
+    from ..refinement.refine import RefinementOptions
+    from ..splats.io import read_offset, read_splats, splat_suffix, write_splats
+    from ..system.files import scratch_folder
+
+    if cameras is None:
+        raise InputError("--cameras: missing; give the cameras of the images")
+    if out is None:
+        raise InputError("--out: missing; give the splat file to write, such as refined.ply")
+    splat_suffix(out)
+    _protect_inputs(scene, cameras, images or [], out)
+    if find_spec("numba") is None:
+        raise InputError("refinement needs numba, which is not installed; pip install 'idesplat[fast]'")
+    gaussians, offset = read_splats(scene), read_offset(scene)
+    with scratch_folder() as folder:
+        views = _read_views(cameras, camera_format, images or [], offset, max_side, folder)
+    options = RefinementOptions(steps=steps or STEPS_PER_VIEW * len(views), seed=seed)
+    refined = _fit(gaussians, views, options)
+    for line in write_splats(out, refined.gaussians, offset):
+        note(f"note: {line}")
+    first, last = refined.psnr[: len(views)], refined.psnr[-len(views) :]
+    say(
+        f"wrote {out}: {len(refined.gaussians):,} Gaussians, {refined.steps} steps on {len(views)} images, their PSNR "
+        f"{sum(first) / len(first):.2f} dB in the first round and {sum(last) / len(last):.2f} dB in the last"
+    )
+
+
+def main() -> None:
+    """Run the command."""
+    run(refine)
+
+
+def _protect_inputs(scene: Path, cameras: Path, images: list[Path], out: Path) -> None:
+    """Find out before the work whether the file can be written, and is none of the files to read."""
+    from .input_files import camera_files, given_images
+
+    outputs().reads("the scene", [scene])
+    outputs().reads("the cameras", camera_files(cameras))
+    outputs().reads("an image", given_images(images))
+    outputs().writes("--out", [out])
+
+
+def _read_views(
+    cameras: Path, form: CameraFormat | None, images: list[Path], offset: "np.ndarray", max_side: int, folder: Path
+) -> "list[PosedImage]":
+    """The images with their cameras in the scene's world; `folder` is for the frames of a video."""
+    from ..cameras.camera import offset_cameras
+    from ..cameras.io import read_cameras
+    from ..refinement.views import load_posed_images
+    from ..views.batch import match_images_to_cameras
+    from ..views.sources import find_input_images
+
+    files = find_input_images(images, cameras, form, folder)
+    pairs = match_images_to_cameras(files, read_cameras(cameras, files, form))
+    placed = offset_cameras([camera for _, camera in pairs], offset)
+    return load_posed_images([(file, camera) for (file, _), camera in zip(pairs, placed, strict=True)], max_side)
+
+
+def _fit(gaussians: "Gaussians", views: "list[PosedImage]", options: "RefinementOptions") -> "Refined":
+    """Refine with progress; what has been reached is the result if the user stops it."""
+    from ..refinement.refine import refine as fit
+
+    stopped = False
+
+    def heard(number: int, frame: object) -> None:
+        nonlocal stopped
+        stopped = True
+
+    before = signal.signal(signal.SIGINT, heard)
+    try:
+        refined = fit(gaussians, views, options, lambda step, psnr: not stopped)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if stopped:
+        note(f"stopped after {refined.steps} of {options.steps} steps")
+    return refined

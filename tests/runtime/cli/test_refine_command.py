@@ -1,0 +1,66 @@
+"""The command idesplat refine: it writes a scene closer to the images, and says in one line what is missing."""
+
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import run_command
+from idesplat.runtime.cameras.camera import Camera
+from idesplat.runtime.cameras.io import read_cameras
+from idesplat.runtime.cli.refine import main
+from idesplat.runtime.splats.formats.ply import write_ply
+from idesplat.runtime.splats.gaussians import Gaussians, with_colours
+from idesplat.runtime.splats.io import read_splats
+from scene_files import snapshot
+
+
+def grey_wall(camera: Camera) -> Gaussians:
+    """A grid of Gaussians that fills what a camera sees, two units before it."""
+    x, y = np.meshgrid(*(np.linspace(0, size, 16) for size in (camera.width, camera.height)))
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ np.linalg.inv(camera.K).T
+    means = 2 * rays @ camera.extrinsics[:3, :3].T + camera.extrinsics[:3, 3]
+    count = len(means)
+    quats, grey = np.tile((1.0, 0, 0, 0), (count, 1)), np.full((count, 3), 0.5)
+    return with_colours(means, np.full((count, 3), 0.1), quats, np.full(count, 0.9), grey)
+
+
+@pytest.fixture
+def folder(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    shutil.copytree(scene / "images", tmp_path / "images")
+    shutil.copy(scene / "transforms.json", tmp_path)
+    write_ply(tmp_path / "scene.ply", grey_wall(read_cameras(tmp_path / "transforms.json")[0]))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+GIVEN = ("scene.ply", "-i", "images", "-c", "transforms.json")
+
+
+def test_writes_a_refined_scene(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(main, *GIVEN, "-o", "out.ply", "--steps", "100", "--max-side", "64") == 0
+    before, after = read_splats(Path("scene.ply")), read_splats(Path("out.ply"))
+    assert len(before) == len(after) and not np.array_equal(before.sh, after.sh)
+    first, last = map(float, re.findall(r"([0-9.]+) dB", capsys.readouterr().out))
+    assert last > first + 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("scene.ply", "-i", "images", "-o", "out.ply"), "--cameras: missing"),
+        (GIVEN, "--out: missing"),
+        ((*GIVEN, "-o", "scene.ply"), "scene.ply"),
+        ((*GIVEN, "-o", "out.txt"), "out.txt"),
+        (("none.ply", *GIVEN[1:], "-o", "out.ply"), "none.ply"),
+    ],
+)
+def test_invalid_input_is_one_line(
+    folder: Path, arguments: tuple[str, ...], expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = snapshot(folder)
+    assert run_command(main, *arguments) == 2
+    error = capsys.readouterr().err
+    assert expected in error and error.count("\n") == 1
+    assert snapshot(folder) == before

@@ -1,0 +1,115 @@
+"""Refinement: it brings a scene closer to its images, depends on the seed alone, and stops when told to."""
+
+import numpy as np
+import pytest
+from idesplat.runtime.refinement.rasterizer import GradientRasterizer, Parameters
+from idesplat.runtime.refinement.refine import PosedImage, RefinementOptions, refine
+from idesplat.runtime.rendering.render import render_view
+from idesplat.runtime.splats.gaussians import Gaussians
+
+SIZE = 32
+K = np.array([[30.0, 0, SIZE / 2], [0, 30, SIZE / 2], [0, 0, 1]])
+
+
+def scene(seed: int) -> Gaussians:
+    rng = np.random.default_rng(seed)
+    count = 400
+    return Gaussians(
+        means=(rng.uniform(-1, 1, (count, 3)) * (2, 2, 0.5) + (0, 0, 4)).astype(np.float32),
+        scales=np.full((count, 3), 0.12, np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        opacities=np.full(count, 0.7, np.float32),
+        sh=rng.normal(0, 0.6, (count, 1, 3)).astype(np.float32),
+    )
+
+
+@pytest.fixture(scope="module")
+def views() -> list[PosedImage]:
+    """Images of a scene from three cameras side by side."""
+    images = []
+    for x in (-0.3, 0, 0.3):
+        extrinsics = np.eye(4)
+        extrinsics[0, 3] = x
+        image = render_view(scene(0), extrinsics, K, SIZE, SIZE).rgb
+        weights = np.ones((SIZE, SIZE, 1), np.float32)
+        images.append(PosedImage(image, np.linalg.inv(extrinsics), K, weights))
+    return images
+
+
+@pytest.fixture(scope="module")
+def wrong_colours() -> Gaussians:
+    right = scene(0)
+    noise = np.random.default_rng(1).normal(0, 0.5, right.sh.shape).astype(np.float32)
+    return Gaussians(right.means, right.scales, right.quats, right.opacities, right.sh + noise)
+
+
+def held_out_error(gaussians: Gaussians) -> float:
+    extrinsics = np.eye(4)
+    extrinsics[:2, 3] = 0.15, 0.1
+    found, true = (render_view(each, extrinsics, K, SIZE, SIZE).rgb for each in (gaussians, scene(0)))
+    return float(np.square(found - true).mean())
+
+
+def test_a_view_that_was_not_given_comes_closer_too(views: list[PosedImage], wrong_colours: Gaussians) -> None:
+    refined = refine(wrong_colours, views, RefinementOptions(steps=150, lr_dc=2e-2, scale_factor=1, max_opacity=0.9))
+    assert refined.steps == 150
+    assert held_out_error(refined.gaussians) < 0.25 * held_out_error(wrong_colours)
+    assert np.mean(refined.psnr[-3:]) > np.mean(refined.psnr[:3]) + 6
+
+
+def test_the_result_depends_on_the_seed_alone(views: list[PosedImage], wrong_colours: Gaussians) -> None:
+    results = [refine(wrong_colours, views, RefinementOptions(steps=9, seed=seed)).gaussians for seed in (0, 0, 1)]
+    np.testing.assert_array_equal(results[0].sh, results[1].sh)
+    assert not np.array_equal(results[0].sh, results[2].sh)
+
+
+def test_stops_when_told_to_and_leaves_its_input_alone(views: list[PosedImage], wrong_colours: Gaussians) -> None:
+    means = wrong_colours.means.copy()
+    refined = refine(wrong_colours, views, RefinementOptions(steps=100), lambda step, psnr: step < 4)
+    assert refined.steps == 5
+    np.testing.assert_array_equal(wrong_colours.means, means)
+
+
+def test_pixels_without_weight_have_no_effect(views: list[PosedImage], wrong_colours: Gaussians) -> None:
+    ignored = [PosedImage(view.image, view.viewmat, view.K, np.zeros_like(view.weights)) for view in views]
+    refined = refine(wrong_colours, ignored, RefinementOptions(steps=6))
+    np.testing.assert_array_equal(refined.gaussians.sh, wrong_colours.sh)
+
+
+def test_no_gaussian_is_stretched_over_what_the_scene_does_not_cover(views: list[PosedImage]) -> None:
+    """Half of a scene, refined on images of the whole, covers no more than before."""
+    whole = scene(0)
+    half = whole.select(whole.means[:, 0] < 0)
+    refined = refine(half, views, RefinementOptions(steps=60, scale_factor=1, max_opacity=1 - 1e-6)).gaussians
+    before, after = (render_view(each, np.eye(4), K, SIZE, SIZE).alpha for each in (half, refined))
+    assert after[:, 24:].max() < 0.2 and (after > 0.5).mean() < (before > 0.5).mean() + 0.03
+
+
+def test_gaussians_that_no_view_sees_stay(views: list[PosedImage], wrong_colours: Gaussians) -> None:
+    behind = scene(5)
+    behind = Gaussians(-behind.means, behind.scales, behind.quats, behind.opacities, behind.sh)
+    together = Gaussians(
+        *(
+            np.concatenate(pair)
+            for pair in zip(
+                (behind.means, behind.scales, behind.quats, behind.opacities, behind.sh),
+                (
+                    wrong_colours.means,
+                    wrong_colours.scales,
+                    wrong_colours.quats,
+                    wrong_colours.opacities,
+                    wrong_colours.sh,
+                ),
+                strict=True,
+            )
+        )
+    )
+    refined = refine(together, views, RefinementOptions(steps=6)).gaussians
+    np.testing.assert_array_equal(refined.means[: len(behind)], behind.means)
+    assert not np.array_equal(refined.means[len(behind) :], wrong_colours.means)
+
+
+def test_an_empty_scene_renders_as_nothing() -> None:
+    empty = Parameters(*(np.zeros((0, *shape), np.float32) for shape in ((3,), (4,), (3,), (), (1, 3))))
+    view = PosedImage(np.zeros((8, 8, 3), np.float32), np.eye(4), K, np.ones((8, 8, 1), np.float32))
+    assert not GradientRasterizer(empty).forward(view.target).rgb.any()
