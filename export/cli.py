@@ -91,7 +91,8 @@ def _logging_to_terminal() -> Iterator[None]:
     logger, handler = logging.getLogger(__package__), _TerminalHandler()
     level = logger.level
     logger.addHandler(handler)
-    logger.setLevel(logging.INFO)
+    handler.setLevel(logging.INFO)
+    logger.setLevel(min(logging.INFO, logger.getEffectiveLevel()))  # lower with -vv, for the log
     try:
         yield
     finally:

@@ -97,6 +97,7 @@ def convert(
         with working("tracing the network (a minute or so)"):
             graphs = export_graphs(network, metadata, static, make_folder(folder / "graphs"))
         logger.info("traced: %s nodes, opset %s, %.0f MB", graphs.nodes, OPSET, graphs.bytes / 1e6)
+        logger.debug("stages: %s", ", ".join(stage.name for stage in graphs.stages))
         fused = save_model(graphs.whole, make_folder(folders[out.parent] / "fused") / out.name) if out else []
         new = make_folder(folders[staged.parent] / "staged") if staged else None
         stages = _write_stages(graphs, new) if new else [(stage, graphs.of_stage(stage)) for stage in graphs.stages]
@@ -104,6 +105,7 @@ def convert(
         errors = list(progress(verify(network, exported, metadata, static), "verifying against PyTorch"))
         if not all(error.passed for error in errors):
             return errors, []
+        logger.debug("verified %d tensors, comparing the weights", len(errors))
         if fused:
             check_weights(graphs.whole, fused[0])
         for stage, path in stages if staged else []:
@@ -112,6 +114,7 @@ def convert(
         if staged is not None and new is not None:
             replace_folder(new, staged)
             files.append(staged)
+    logger.debug("published %s", ", ".join(map(str, files)))
     return errors, files
 
 

@@ -34,6 +34,19 @@ ORDERS = {
     "tools": ("processes", "synthetic", "training", "evaluation", "benchmark", "figures"),
 }
 
+# Modules that import others of ours inside functions: commands, for their start-up time, and these.
+LAZY = {
+    "export.pipeline": "PyTorch and onnx are optional",
+    "runtime.rendering.rasterizer": "numba is optional",
+    "tools.benchmark.runner": "PyTorch is optional",
+    "tools.benchmark.training": "PyTorch is optional",
+    "tools.benchmark.worker": "measures what each import costs its process",
+    "tools.evaluation.cases": "numba is optional, and needed for synthetic scenes alone",
+    "tools.evaluation.evaluate": "numba is optional, and needed for synthetic scenes alone",
+    "tools.evaluation.metrics": "PyTorch is optional, and needed for LPIPS alone",
+    "tools.synthetic.make_scene": "a command",
+}
+
 
 def modules() -> dict[str, Path]:
     """Every module by its name below `idesplat`, such as `runtime.cameras.camera`."""
@@ -113,6 +126,34 @@ def test_packages_import_only_what_stands_before_them(graph: dict[str, set[str]]
         for module in imported:
             if module.startswith(f"{package}."):
                 assert rank[module.split(".")[1]] <= rank[own], f"{name} imports {module}"
+
+
+def test_imports_inside_functions_are_for_start_up_time_or_optional_dependencies() -> None:
+    known = modules()
+    found = set()
+    for name, path in known.items():
+        functions = (node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if _is_function(node))
+        inside = (node for function in functions for node in ast.walk(function) if isinstance(node, ast.ImportFrom))
+        if any(_absolute(node, name, path.name == "__init__.py") is not None for node in inside):
+            found.add(name)
+    assert {name for name in found if not _is_command(name)} == set(LAZY)
+
+
+def _is_function(node: ast.AST) -> bool:
+    return isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))
+
+
+def _is_command(name: str) -> bool:
+    return name.startswith("runtime.cli.") or name.endswith(".cli")
+
+
+def test_libraries_do_not_depend_on_commands(graph: dict[str, set[str]]) -> None:
+    """Reports of commands print, and scripts are commands."""
+    known = modules()
+    for name, imported in graph.items():
+        is_script = 'if __name__ == "__main__"' in known[name].read_text(encoding="utf-8")
+        if not (_is_command(name) or name.endswith(".report") or is_script):
+            assert not {module for module in imported if module.startswith("runtime.cli")}, name
 
 
 def test_every_package_is_in_the_wheel() -> None:

@@ -1,5 +1,6 @@
 """Images and cameras that belong together, where only the images are given."""
 
+import logging
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,6 +11,8 @@ from ..images.finding import SUFFIXES, is_video
 from ..system.output_names import CAMERAS_FILE
 from .image_files import IMAGE_FOLDERS
 from .io import detect_format
+
+LOG = logging.getLogger(__name__)
 
 BESIDE_VIDEO = (".json", ".txt")  # endings of cameras that are called like a video
 
@@ -35,6 +38,7 @@ def find_cameras(images: Sequence[Path]) -> Found:
         below = [given[0] / name for name in IMAGE_FOLDERS if _has_images(given[0] / name)]
         given = below[:1] or given
     cameras = _beside(given[0]) if given else None
+    LOG.info("cameras beside %s: %s", ", ".join(map(str, given)), cameras or "none")
     if cameras is None:
         return Found(given, None, "no cameras beside the photographs, so they are estimated (--cameras to give them)")
     return Found(given, cameras, f"cameras found beside the photographs: {cameras} (--cameras to give others)")

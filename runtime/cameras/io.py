@@ -4,6 +4,7 @@ A pose is camera-to-world with OpenCV axes (x right, y down, z forward); K is in
 pixel at (0.5, 0.5). The package `formats` says how to add a format.
 """
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
@@ -12,6 +13,8 @@ from .camera import Camera
 from .formats import CameraFormat as CameraFormat
 from .formats import format_module, format_modules, own, transforms
 from .source import CameraSource
+
+LOG = logging.getLogger(__name__)
 
 
 def read_cameras(path: Path, images: Sequence[Path] = (), camera_format: CameraFormat | None = None) -> list[Camera]:
@@ -24,8 +27,10 @@ def read_cameras(path: Path, images: Sequence[Path] = (), camera_format: CameraF
     """
     path = Path(path)
     with error_context(str(path)):
-        cameras: list[Camera] = format_module(camera_format or detect_format(path)).read(path, images)
+        camera_format = camera_format or detect_format(path)
+        cameras: list[Camera] = format_module(camera_format).read(path, images)
         _check_names(cameras)
+    LOG.info("%s: %d cameras, format %s", path, len(cameras), camera_format)
     return cameras
 
 

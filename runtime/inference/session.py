@@ -1,5 +1,6 @@
 """ONNX Runtime sessions: provider checks, thread and memory settings, runs with a time limit."""
 
+import logging
 import os
 import re
 import threading
@@ -16,6 +17,8 @@ from ..errors import InputError
 from ..system.files import check_regular
 from . import openvino
 from .graph_cache import cache_entry
+
+LOG = logging.getLogger(__name__)
 
 CPU = "CPUExecutionProvider"
 # Errors reach the caller as exceptions; ONNX Runtime's own log would print them to the terminal a second time.
@@ -81,6 +84,7 @@ def open_session(
         with suppress(OSError):  # ONNX Runtime says that there is no such file
             check_regular(model)
     options = _options(config)
+    LOG.debug("opening %s on %s with %s", "a graph in memory" if isinstance(model, bytes) else model, provider, config)
     if provider == openvino.PROVIDER:
         openvino.add_openvino(options)
     if provider == CPU and isinstance(model, Path) and config.optimise:
@@ -152,12 +156,14 @@ def _open_cached(model: Path, options: onnxruntime.SessionOptions) -> onnxruntim
         return _create(model, options)
 
     found = entry.get()
+    LOG.info("%s: %s", model, f"its optimised graph is cached as {found}" if found else "optimising its graph, once")
     try:
         if found is None:
             return entry.put(optimise)
         options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
         return _create(found, options)
     except Exception:  # a damaged model or a full disk: opening the model itself raises the error, if it is the model's
+        LOG.info("%s: the cache cannot be used", model, exc_info=LOG.isEnabledFor(logging.DEBUG))
         if found is not None:
             entry.evict(found)
         return None

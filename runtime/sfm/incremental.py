@@ -35,7 +35,7 @@ def check_pycolmap(images: int) -> None:
     """Raise InputError where pycolmap is not installed."""
     if importlib.util.find_spec("pycolmap") is None:
         raise InputError(
-            f"--cameras estimate: {images} images need pycolmap ({INSTALL}); without it, choose two with --frames"
+            f"--cameras estimate: {images} images need pycolmap ({INSTALL}); without it, choose two with --select"
         )
 
 
@@ -64,7 +64,7 @@ def run_incremental_sfm(images: "Sequence[UncalibratedImage]", refine_focal: boo
     path_of = {_name(index): image.path for index, image in enumerate(images)}
     cameras = [to_camera({**found, "name": str(path_of[found["name"]])}) for found in describe(best)]
     depths = [observed_depths(best, image) for image in best.images.values() if image.has_pose]
-    return cameras, _checked(np.concatenate(depths), len(cameras))
+    return cameras, _checked(np.concatenate([np.zeros(0), *depths]), len(cameras))
 
 
 def _checked(depths: np.ndarray, registered: int) -> np.ndarray:

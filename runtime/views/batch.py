@@ -1,5 +1,6 @@
 """The view batch: images matched to cameras, views selected, and the arrays of the network's input."""
 
+import logging
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -18,6 +19,8 @@ from ..images.header import DamagedImage
 from .depth_range import scene_depths
 from .loader import FeatureImage, ImageCameraPair, ViewLoader
 from .selection import MIN_VIEWS, score_pairs, select_views
+
+LOG = logging.getLogger(__name__)
 
 EXAMPLES = 3  # names listed in a message
 
@@ -154,6 +157,7 @@ def _select(loader: ViewLoader, usable: Sequence[int], count: int) -> tuple[list
         f"nearest neighbours overlap by {overlaps} with a parallax of {angles} degrees, at a scene depth of "
         f"{np.median(depths[chosen]):.3g} from {source}"
     )
+    LOG.info("selected %s: %s", ", ".join(cameras[index].name for index in chosen), selection_reason)
     return [usable[index] for index in chosen], selection_reason
 
 

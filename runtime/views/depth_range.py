@@ -1,5 +1,6 @@
 """Near and far of the views: from the cameras' depth ranges, from triangulated matches, or from the baseline."""
 
+import logging
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
@@ -23,6 +24,8 @@ from ..sfm.features import (
 )
 from .loader import FeatureImage
 from .selection import PairScorer, guess_scene_depths
+
+LOG = logging.getLogger(__name__)
 
 SAMPLED_IMAGES = 3  # that are matched, with two others each, for the depth of the scene
 MAX_EPIPOLAR_ERROR = 1.5  # pixels
@@ -71,6 +74,7 @@ def estimate_depth_range(
 
 
 def _checked(found: DepthRange) -> DepthRange:
+    LOG.info("near %g and far %g: %s", found.near, found.far, found.source)
     if not 0 < found.near < found.far:
         raise InputError(
             f"near {found.near:g} and far {found.far:g} ({found.source}): expected 0 < near < far; "

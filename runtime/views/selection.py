@@ -71,7 +71,7 @@ def select_views(cameras: Sequence[Camera], count: int, depths: np.ndarray | Non
     cost = scorer.score(first, second).cost
     if not np.isfinite(cost).any():
         raise InputError(
-            "no two cameras see the same from different places; depth needs a baseline. Choose other --frames"
+            "no two cameras see the same from different places; depth needs a baseline; choose others with --select"
         )
     best = cost.argmin()
     return sorted(_extend(scorer, [int(first[best]), int(second[best])], count))

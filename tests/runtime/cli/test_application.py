@@ -140,6 +140,12 @@ def test_a_range_is_no_number(workplace, capsys):
     assert "'--frames': 0-1 is no whole number" in capsys.readouterr().err
 
 
+def test_the_library_logs_what_it_decides_and_prints_nothing_otherwise(workplace, scene, capsys):
+    for verbose, logged in (((), False), (("-v",), True)):
+        assert run_command(idesplat, "cameras", "convert", str(scene / "transforms.json"), "c.json", *verbose) == 0
+        assert ("INFO idesplat.runtime.cameras.io: " in capsys.readouterr().err) == logged
+
+
 def test_verbose_logs_to_stderr(workplace, capsys):
     assert run_command(idesplat, "convert", "scene.ply", "a.splat", "-vv") == 0
     printed = capsys.readouterr()

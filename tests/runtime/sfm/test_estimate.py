@@ -1,5 +1,9 @@
 """Cameras from images alone, compared with the known cameras of a synthetic room."""
 
+import sys
+from types import SimpleNamespace
+from unittest.mock import MagicMock
+
 import cv2
 import numpy as np
 import pytest
@@ -7,6 +11,7 @@ from idesplat.runtime.cameras.io import read_cameras
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.images.exif import exif_focal, parse_focal
 from idesplat.runtime.images.io import load_image
+from idesplat.runtime.sfm import incremental
 from idesplat.runtime.sfm.estimate import estimate_cameras
 from idesplat.tools.synthetic.make_scene import make_scene
 from PIL import Image
@@ -122,8 +127,21 @@ def test_refusals(room, tmp_path, monkeypatch):
             estimate_cameras(paths, given)
         assert "\n" not in str(caught.value)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"3 images need pycolmap \(pip install .*--frames"):
+    with pytest.raises(InputError, match=r"3 images need pycolmap \(pip install .*--select"):
         estimate_cameras([first, second, blank], focal)
+
+
+@pytest.mark.parametrize("depths", [[], [np.nan, np.nan], [-1.0, -2.0]])
+def test_a_reconstruction_without_points_in_front_of_the_cameras(monkeypatch, depths):
+    """The median depth is the unit, so it must be one; COLMAP is replaced by what it would return."""
+    model = SimpleNamespace(images={1: SimpleNamespace(has_pose=True)}, num_reg_images=lambda: 1)
+    monkeypatch.setitem(sys.modules, "pycolmap", MagicMock(incremental_mapping=lambda *_: {0: model}))
+    replaced = {"_fill": None, "describe": [], "observed_depths": np.array(depths)}
+    for name, value in replaced.items():
+        monkeypatch.setattr(incremental, name, lambda *_, value=value: value)
+    with pytest.raises(InputError, match=r"no points in front of them found, .*; give more images") as caught:
+        incremental.run_incremental_sfm([], refine_focal=True)
+    assert "\n" not in str(caught.value)
 
 
 def test_images_as_a_phone_saves_them(room, tmp_path):
