@@ -102,6 +102,7 @@ def test_manifest_names_the_networks_own_stages(exported):
         assert [value.name for value in model.graph.output] == stage.outputs
 
 
+@pytest.mark.slow
 def test_fixed_views_and_size(small_checkpoint, presets, tmp_path, capsys):
     out = tmp_path / "fixed.onnx"
     assert run_command(cli.main, small_checkpoint, out, "--views", 2, "--size", "64x64") == 0
@@ -116,6 +117,7 @@ def test_fixed_views_and_size(small_checkpoint, presets, tmp_path, capsys):
     assert "fixed.onnx" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_mismatching_graph_leaves_no_file(small_checkpoint, presets, tmp_path, monkeypatch, capsys):
     mismatch = TensorError(
         "2 views", "encoder", "encoder.features_mv", ErrorQuantiles(1, 2, 3), ErrorQuantiles(1, 2, 2), 3.0

@@ -144,6 +144,7 @@ def test_texts_name_the_safe_way_to_run_modules():
 # ---- what is left behind
 
 
+@pytest.mark.slow
 @pytest.mark.posix
 def test_nothing_but_our_cache_is_left_behind(scene, tmp_path):
     """Neither ONNX Runtime's device id and events nor a temporary file."""

@@ -51,6 +51,7 @@ def small_scene(seed: int, degree: int) -> list[Tensor]:
     return [torch.from_numpy(part).requires_grad_() for part in parts]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "degree"), [(0, 0), (1, 1), (2, 3)])
 def test_gradients_match_finite_differences(seed: int, degree: int) -> None:
     """For every input: Gaussians, camera and background, through colour, alpha and depth."""

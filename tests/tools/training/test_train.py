@@ -196,6 +196,7 @@ def test_prefetched_samples_keep_their_order_and_repeat() -> None:
         assert torch.equal(views.images, again.images) and torch.equal(views.inverse_depth, again.inverse_depth)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("objective", list(Objective))
 def test_a_few_steps_on_one_scene_reduce_the_loss(objective: Objective) -> None:
     """Depth and novel views improve where the objective contains them."""
@@ -352,6 +353,7 @@ def test_bad_inputs_are_one_line_each(finished: Path, tmp_path: Path) -> None:
     assert not out.exists() or not list(out.iterdir())
 
 
+@pytest.mark.slow
 def test_captures_are_supervised_by_target_views_alone(scene: Path, tmp_path: Path) -> None:
     settings = replace(SETTINGS, objective="photometric", steps=2, data=[str(scene)])
     Trainer(tmp_path, settings, SMALL).fit(save_every=1e9, validate_every=2)
