@@ -6,7 +6,14 @@ import cv2
 import numpy as np
 
 from ..geometry.intrinsics import to_opencv_pixels
-from .camera import Camera
+from .camera import Camera, resize_camera
+
+
+def shrink(image: np.ndarray, camera: Camera, max_side: int) -> tuple[np.ndarray, Camera]:
+    """The image [height, width, 3] with its longer side at most `max_side` pixels, and the camera of that size."""
+    factor = min(1, max_side / max(image.shape[:2]))
+    width, height = max(1, round(camera.width * factor)), max(1, round(camera.height * factor))
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), resize_camera(camera, width, height)
 
 
 def undistort(image: np.ndarray, camera: Camera) -> tuple[np.ndarray, Camera]:

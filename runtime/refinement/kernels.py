@@ -13,7 +13,8 @@ import numba
 import numpy as np
 
 from ..geometry.projection import EPS2D, FOV_MARGIN
-from ..geometry.sh import SH_0, SH_1, SH_2, SH_3
+from ..geometry.sh import SH_1, SH_2, SH_3
+from ..rendering.rasterizer_numba import fill_rotation, fill_sh_basis
 from ..rendering.types import MAX_ALPHA, MIN_ALPHA
 
 BAND_ROWS = 16
@@ -27,38 +28,6 @@ WEIGHT = 9
 ENTRY = 10
 
 compiled = functools.partial(numba.njit, cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp"})
-
-
-@compiled()
-def _rotation(quat: np.ndarray, rotation: np.ndarray) -> float:
-    """Fill the rotation matrix [3, 3] of a wxyz quaternion, and return the quaternion's length."""
-    w, x, y, z = np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
-    length = max(np.sqrt(w * w + x * x + y * y + z * z), 1e-12)
-    w, x, y, z = w / length, x / length, y / length, z / length
-    rotation[0, 0], rotation[0, 1], rotation[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-    rotation[1, 0], rotation[1, 1], rotation[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-    rotation[2, 0], rotation[2, 1], rotation[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
-    return length
-
-
-@compiled()
-def _sh_basis(x: float, y: float, z: float, basis: np.ndarray) -> None:
-    """Fill the SH basis [coefficients] at a unit direction."""
-    count = len(basis)
-    basis[0] = SH_0
-    if count > 1:
-        basis[1], basis[2], basis[3] = -SH_1 * y, SH_1 * z, -SH_1 * x
-    if count > 4:
-        xx, yy, zz = x * x, y * y, z * z
-        basis[4], basis[5] = SH_2[0] * x * y, -SH_2[0] * y * z
-        basis[6] = SH_2[1] * (2 * zz - xx - yy)
-        basis[7], basis[8] = -SH_2[0] * x * z, SH_2[2] * (xx - yy)
-        if count > 9:
-            basis[9], basis[10] = -SH_3[0] * y * (3 * xx - yy), SH_3[1] * x * y * z
-            basis[11] = -SH_3[2] * y * (4 * zz - xx - yy)
-            basis[12] = SH_3[3] * z * (2 * zz - 3 * xx - 3 * yy)
-            basis[13] = -SH_3[2] * x * (4 * zz - xx - yy)
-            basis[14], basis[15] = SH_3[4] * z * (xx - yy), -SH_3[0] * x * (xx - 3 * yy)
 
 
 @compiled()
@@ -128,7 +97,7 @@ def project(
         x, y = fx * across + cx, fy * down + cy
         across = min(max(across, -cx / fx - margin_x), (width - cx) / fx + margin_x)
         down = min(max(down, -cy / fy - margin_y), (height - cy) / fy + margin_y)
-        _rotation(quats[index], rotation)
+        fill_rotation(quats[index], rotation)
         xx, xy, yy = EPS2D, 0.0, EPS2D
         for column in range(3):
             scale = np.exp(np.float64(log_scales[index, column]))
@@ -158,7 +127,7 @@ def project(
         out[CONIC_XX], out[CONIC_XY], out[CONIC_YY] = yy / determinant, -xy / determinant, xx / determinant
         dx, dy, dz = means[index, 0] - camera[0], means[index, 1] - camera[1], means[index, 2] - camera[2]
         length = max(np.sqrt(dx * dx + dy * dy + dz * dz), 1e-12)
-        _sh_basis(dx / length, dy / length, dz / length, basis)
+        fill_sh_basis(dx / length, dy / length, dz / length, basis)
         for channel in range(3):
             colour = 0.5
             for coefficient in range(len(basis)):
@@ -365,7 +334,7 @@ def _gaussian_gradient(
     lowest_x, highest_x = -cx / fx - margin_x, (width - cx) / fx + margin_x
     lowest_y, highest_y = -cy / fy - margin_y, (height - cy) / fy + margin_y
     across, down = min(max(px / z, lowest_x), highest_x), min(max(py / z, lowest_y), highest_y)
-    length = _rotation(quat, rotation)
+    length = fill_rotation(quat, rotation)
     for row in range(3):
         rows[0, row] = fx / z * (viewmat[0, row] - across * viewmat[2, row])
         rows[1, row] = fy / z * (viewmat[1, row] - down * viewmat[2, row])
@@ -429,7 +398,7 @@ def _gaussian_gradient(
     distance = max(np.sqrt(dx * dx + dy * dy + dz * dz), 1e-12)
     dx, dy, dz = dx / distance, dy / distance, dz / distance
     coefficients = len(sh)
-    _sh_basis(dx, dy, dz, basis[0])
+    fill_sh_basis(dx, dy, dz, basis[0])
     for coefficient in range(coefficients):
         basis[1, coefficient] = 0.0
     for channel in range(3):

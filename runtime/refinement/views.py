@@ -3,11 +3,10 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from ..cameras.camera import Camera, resize_camera
-from ..cameras.undistortion import undistort, undistortion_valid_mask
+from ..cameras.undistortion import shrink, undistort, undistortion_valid_mask
 from ..errors import InputError, error_context
 from ..geometry.rigid import invert_rigid
 from ..images.io import load_image
@@ -28,15 +27,9 @@ def load_posed_images(pairs: Sequence[tuple[Path, Camera]], max_side: int) -> li
 
 def _load(path: Path, camera: Camera, max_side: int) -> PosedImage:
     image = load_image(path)
-    height, width = image.shape[:2]
     with error_context(str(path)):
-        camera = resize_camera(camera, width, height)
-    factor = min(1, max_side / max(height, width))
-    width, height = max(1, round(width * factor)), max(1, round(height * factor))
-    image, camera = (
-        cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA),
-        resize_camera(camera, width, height),
-    )
+        camera = resize_camera(camera, image.shape[1], image.shape[0])
+    image, camera = shrink(image, camera, max_side)
     weights = undistortion_valid_mask(camera)[..., None].astype(np.float32)
     image, camera = undistort(image, camera)
     return PosedImage(image.astype(np.float32) / 255, invert_rigid(camera.extrinsics), camera.K, weights)

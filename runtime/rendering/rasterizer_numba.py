@@ -81,7 +81,7 @@ def _project(
         x, y = fx * slope_x + cx, fy * slope_y + cy
         slope_x = min(max(slope_x, -cx / fx - margin_x), (width - cx) / fx + margin_x)
         slope_y = min(max(slope_y, -cy / fy - margin_y), (height - cy) / fy + margin_y)
-        _rotation(quats[index], rotation)
+        fill_rotation(quats[index], rotation)
         xx, xy, yy = 0.0, 0.0, 0.0
         for column in range(3):
             half_x, half_y = 0.0, 0.0
@@ -110,14 +110,15 @@ def _project(
 
 
 @_compiled()
-def _rotation(quat: np.ndarray, rotation: np.ndarray) -> None:
-    """Fill the rotation matrix [3, 3] of a wxyz quaternion, which is normalised first; zero means no rotation."""
+def fill_rotation(quat: np.ndarray, rotation: np.ndarray) -> float:
+    """Fill the rotation matrix [3, 3] of a wxyz quaternion of any length, and return that; zero means no rotation."""
     w, x, y, z = np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
     norm = max(np.sqrt(w * w + x * x + y * y + z * z), 1e-12)
     w, x, y, z = w / norm, x / norm, y / norm, z / norm
     rotation[0, 0], rotation[0, 1], rotation[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
     rotation[1, 0], rotation[1, 1], rotation[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
     rotation[2, 0], rotation[2, 1], rotation[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    return norm
 
 
 @_compiled()
@@ -136,7 +137,15 @@ def _fill_basis(mean: np.ndarray, position: np.ndarray, basis: np.ndarray) -> No
         return
     x, y, z = mean[0] - position[0], mean[1] - position[1], mean[2] - position[2]
     norm = max(np.sqrt(x * x + y * y + z * z), 1e-12)
-    x, y, z = x / norm, y / norm, z / norm
+    fill_sh_basis(x / norm, y / norm, z / norm, basis)
+
+
+@_compiled()
+def fill_sh_basis(x: float, y: float, z: float, basis: np.ndarray) -> None:
+    """Fill the SH basis functions [coefficients] at a unit direction."""
+    basis[0] = SH_0
+    if len(basis) == 1:
+        return
     basis[1], basis[2], basis[3] = -SH_1 * y, SH_1 * z, -SH_1 * x
     if len(basis) == 4:
         return

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from ..cameras.camera import Camera, resize_camera
-from ..cameras.undistortion import undistort
+from ..cameras.undistortion import shrink, undistort
 from ..errors import error_context
 from ..images.io import load_image
 from ..images.resizing import resize_and_crop
@@ -29,10 +29,7 @@ class FeatureImage:
     """
 
     def __init__(self, image: np.ndarray, camera: Camera) -> None:
-        factor = min(1, FEATURE_SIDE / max(image.shape[:2]))
-        width, height = max(1, round(camera.width * factor)), max(1, round(camera.height * factor))
-        small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-        small, self.camera = undistort(small, resize_camera(camera, width, height))
+        small, self.camera = undistort(*shrink(image, camera, FEATURE_SIDE))
         self._grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
 
     @cached_property
