@@ -1,12 +1,27 @@
 """Undistortion: resampling an image to a pinhole camera with the same K."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from ..geometry.intrinsics import to_opencv_pixels
 from .camera import Camera, resize_camera
+
+
+@dataclass(frozen=True, eq=False)
+class UndistortedImage:
+    """An image of a pinhole camera: uint8 RGB [height, width, 3], and the pixels that the lens saw, [height, width]."""
+
+    image: np.ndarray
+    camera: Camera
+    valid: np.ndarray
+
+
+def undistorted_copy(image: np.ndarray, camera: Camera, max_side: int) -> UndistortedImage:
+    """A copy of an image of the camera's size, its longer side at most `max_side` pixels, without distortion."""
+    image, camera = shrink(image, camera, max_side)
+    return UndistortedImage(*undistort(image, camera), undistortion_valid_mask(camera))
 
 
 def shrink(image: np.ndarray, camera: Camera, max_side: int) -> tuple[np.ndarray, Camera]:

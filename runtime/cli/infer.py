@@ -10,7 +10,9 @@ import typer
 from ..cameras.formats import ESTIMATE
 from ..errors import InputError
 from ..inference.depth_format import DepthFormat
+from ..reconstruction.quality import Quality
 from ..system.output_names import SPLATS
+from .interrupting import StopOnInterrupt
 from .options import (
     CamerasFormat,
     Config,
@@ -18,6 +20,7 @@ from .options import (
     Focal,
     Images,
     Json,
+    MaxGaussians,
     Model,
     Near,
     Overwrite,
@@ -70,14 +73,36 @@ def infer(
     model: Model = None,
     camera_format: CamerasFormat = None,
     focal: Focal = None,
+    quality: Annotated[
+        Quality | None,
+        typer.Option(
+            help="fast: two images, as the network predicts them. standard: eight, fused and refined. high: 24, "
+            "larger, with more steps. Else standard, and fast with --model."
+        ),
+    ] = None,
     views: Annotated[
-        int | None,
-        typer.Option(help="How many images to use, those with the best baselines: 2, or all of --select.", min=2),
+        str | None,
+        typer.Option(
+            help="How many images to use, those with the best baselines; else as --quality says, or all of --select.",
+            metavar="N|all",
+        ),
     ] = None,
     select: Annotated[
         str | None, typer.Option(help="Images to use: names, numbers from 0, 0-3 or 0:8:2, with commas between.")
     ] = None,
     size: Size = None,
+    crop: Annotated[
+        bool, typer.Option("--crop", help="Use the middle of the images at the model's trained size.")
+    ] = False,
+    refine: Annotated[
+        str | None,
+        typer.Option(
+            help="Steps of refinement on the images, one image each, or its time such as 30s; 0 for none. Else as "
+            "--quality says.",
+            metavar="N|SECONDSs",
+        ),
+    ] = None,
+    max_gaussians: MaxGaussians = 0,
     near: Near = None,
     far: Far = None,
     offset: Annotated[
@@ -114,6 +139,14 @@ def infer(
             rich_help_panel=FILTERS,
         ),
     ] = 0,
+    remove_contradicted: Annotated[
+        bool,
+        typer.Option(
+            "--remove-contradicted",
+            help="Leave out what other views see through, with three views or more (--quality standard and high do).",
+            rich_help_panel=FILTERS,
+        ),
+    ] = False,
     merge_duplicates: Annotated[
         bool,
         typer.Option(
@@ -145,6 +178,7 @@ def infer(
     """
     from ..images.sizes import parse_size
     from ..inference.bundled_model import bundled_model
+    from ..inference.inputs import parse_views
     from ..inference.model_files import read_model
     from ..reconstruction.pipeline import reconstruct
     from ..splats.filtering import FilterOptions
@@ -159,25 +193,36 @@ def infer(
     )
     model = model or bundled_model()
     targets.announce(model)
-    filters = FilterOptions(min_opacity, crop_border, max_depth_jump, min_consistency, merge_duplicates)
+    filters = FilterOptions(
+        min_opacity, crop_border, max_depth_jump, min_consistency, remove_contradicted, merge_duplicates
+    )
     files = read_model(model)
     targets.check_model(files, filters)
-    result = reconstruct(
-        given,
-        cameras,
-        model=files,
-        camera_format=camera_format,
-        focal=focal,
-        select=select,
-        views=views,
-        size=parse_size(size) if size else None,
-        near=near,
-        far=far,
-        offset=offset,
-        provider=provider,
-        filters=FilterOptions() if is_mesh(targets.out) else filters,
-        on_inputs=targets.announce_views,
-    )
+    surface = is_mesh(targets.out)
+    with StopOnInterrupt() as on_step:
+        result = reconstruct(
+            given,
+            cameras,
+            model=files,
+            camera_format=camera_format,
+            focal=focal,
+            select=select,
+            views=parse_views(views) if views else None,
+            size=parse_size(size) if size else None,
+            crop=crop,
+            quality=quality,
+            refine="0" if surface else refine,
+            max_gaussians=0 if surface else max_gaussians,
+            near=near,
+            far=far,
+            offset=offset,
+            provider=provider,
+            filters=FilterOptions() if surface else filters,
+            on_inputs=targets.announce_views,
+            on_step=on_step,
+        )
+    if on_step.stopped:
+        note(f"refinement stopped after {len(result.psnr)} steps")
     seconds = targets.write(result, filters, started)
     _tell(result, targets, seconds, camera_format)
     if timings:

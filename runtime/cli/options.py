@@ -82,3 +82,7 @@ Verbose = Annotated[
     ),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show neither progress nor notes.", rich_help_panel=GENERAL)]
+
+MaxGaussians = Annotated[
+    int, typer.Option(help="Keep at most so many Gaussians, those that contribute most to the images; 0: all.", min=0)
+]

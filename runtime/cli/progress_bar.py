@@ -59,13 +59,14 @@ class _Display:
                 progress.BarColumn(),
                 progress.TaskProgressColumn(show_speed=True),
                 progress.TimeRemainingColumn(elapsed_when_finished=True),
+                progress.TextColumn("{task.fields[detail]}"),
             )
             bar = self._shown[work.description] = progress.Progress(
                 *columns, console=Console(stderr=True), transient=True
             )
-            bar.add_task(_literal(work.description), total=work.total)
+            bar.add_task(_literal(work.description), total=work.total, detail="")
             bar.start()
-        bar.update(bar.task_ids[0], completed=work.done)
+        bar.update(bar.task_ids[0], completed=work.done, detail=_literal(work.detail))
 
     def _start_spinner(self, description: str) -> None:
         from rich.console import Console

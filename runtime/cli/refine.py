@@ -1,7 +1,5 @@
 """The command `idesplat refine`: a splat file fitted to the images of its scene."""
 
-import signal
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,7 +7,8 @@ import typer
 
 from ..cameras.io import CameraFormat
 from ..errors import InputError
-from .options import Cameras, CamerasFormat, Config, Images, Overwrite, Quiet, Verbose
+from .interrupting import StopOnInterrupt
+from .options import Cameras, CamerasFormat, Config, Images, MaxGaussians, Overwrite, Quiet, Verbose
 from .outputs import command, outputs
 from .reporting import note
 from .terminal import run, say
@@ -17,11 +16,11 @@ from .terminal import run, say
 if TYPE_CHECKING:
     import numpy as np
 
-    from ..refinement.refine import PosedImage, Refined, RefinementOptions
-    from ..splats.gaussians import Gaussians
+    from ..refinement.refine import PosedImage
 
 STEPS_PER_VIEW = 15
 MAX_STEPS = 100_000
+STEPS_HELP = f"Steps of the optimiser, one image each; else {STEPS_PER_VIEW} for each image, and fewer for two."
 
 
 @command("idesplat refine")
@@ -36,23 +35,27 @@ def refine(
     steps: Annotated[
         int | None,
         typer.Option(
-            help=f"Steps of the optimiser, one image each; else {STEPS_PER_VIEW} for each image.", min=1, max=MAX_STEPS
+            help=STEPS_HELP,
+            min=1,
+            max=MAX_STEPS,
         ),
     ] = None,
     max_side: Annotated[int, typer.Option(help="Longer side of the images, in pixels.", min=16, max=4096)] = 512,
     seed: Annotated[int, typer.Option(help="Of the order of the images.", min=0)] = 0,
+    max_gaussians: MaxGaussians = 0,
     overwrite: Overwrite = False,
     config: Config = None,
     verbose: Verbose = 0,
     quiet: Quiet = False,
 ) -> None:
-    """Fit the Gaussians of a splat file to posed images of its scene (needs the extra `fast`).
+    """Fit the Gaussians of a splat file to posed images of its scene.
 
     Parts of the images that the scene does not cover are left as they are.
 
     Ctrl-C ends the refinement and writes what it has reached.
     """
-    from ..refinement.refine import RefinementOptions
+    from ..refinement.options import default_steps, options_for
+    from ..refinement.refine import refine as fit
     from ..splats.io import read_offset, read_splats, splat_suffix, write_splats
     from ..system.files import scratch_folder
 
@@ -62,13 +65,16 @@ def refine(
         raise InputError("--out: missing; give the splat file to write, such as refined.ply")
     splat_suffix(out)
     _protect_inputs(scene, cameras, images or [], out)
-    if find_spec("numba") is None:
-        raise InputError("refinement needs numba, which is not installed; pip install 'idesplat[fast]'")
     gaussians, offset = read_splats(scene), read_offset(scene)
     with scratch_folder() as folder:
         views = _read_views(cameras, camera_format, images or [], offset, max_side, folder)
-    options = RefinementOptions(steps=steps or STEPS_PER_VIEW * len(views), seed=seed)
-    refined = _fit(gaussians, views, options)
+    options = options_for(
+        len(views), steps or default_steps(len(views), STEPS_PER_VIEW), seed=seed, max_gaussians=max_gaussians
+    )
+    with StopOnInterrupt() as on_step:
+        refined = fit(gaussians, views, options, on_step)
+    if on_step.stopped:
+        note(f"stopped after {refined.steps} of {options.steps} steps")
     for line in write_splats(out, refined.gaussians, offset):
         note(f"note: {line}")
     first, last = refined.psnr[: len(views)], refined.psnr[-len(views) :]
@@ -107,23 +113,3 @@ def _read_views(
     pairs = match_images_to_cameras(files, read_cameras(cameras, files, form))
     placed = offset_cameras([camera for _, camera in pairs], offset)
     return load_posed_images([(file, camera) for (file, _), camera in zip(pairs, placed, strict=True)], max_side)
-
-
-def _fit(gaussians: "Gaussians", views: "list[PosedImage]", options: "RefinementOptions") -> "Refined":
-    """Refine with progress; what has been reached is the result if the user stops it."""
-    from ..refinement.refine import refine as fit
-
-    stopped = False
-
-    def heard(number: int, frame: object) -> None:
-        nonlocal stopped
-        stopped = True
-
-    before = signal.signal(signal.SIGINT, heard)
-    try:
-        refined = fit(gaussians, views, options, lambda step, psnr: not stopped)
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if stopped:
-        note(f"stopped after {refined.steps} of {options.steps} steps")
-    return refined

@@ -1,8 +1,12 @@
 """Image sizes: the option --size, and the sizes that a network accepts."""
 
+from math import ceil, log
+
 from ..errors import InputError
 from ..system.limits import SIDE_PIXELS, parse_whole_number
 
+MAX_EXTRA_AREA = 1.3  # by which the pixels of a whole frame may exceed those asked for
+SEARCHED = 8  # further multiples to try for its height
 SHOWN = 40  # characters of an option that a message repeats
 
 
@@ -25,10 +29,18 @@ def is_valid_size(height: int, width: int, multiple: int) -> bool:
     return height % multiple == width % multiple == 0 and min(height, width) >= 2 * multiple
 
 
-def nearest_size(aspect: float, area: float, multiple: int) -> tuple[int, int]:
-    """Height and width, multiples of `multiple`, with about this aspect ratio (height / width) and area in pixels."""
-    height, width = (multiple * max(2, round((area * side) ** 0.5 / multiple)) for side in (aspect, 1 / aspect))
-    return height, width
+def whole_frame_size(aspect: float, area: int, multiple: int) -> tuple[int, int]:
+    """Height and width, multiples of `multiple`, of the aspect ratio (height / width) and of `area` pixels or more.
+
+    Of the sizes with at most MAX_EXTRA_AREA times the area, the one whose aspect ratio is nearest.
+    """
+    candidates = []
+    for rows in range(2, round((area * aspect) ** 0.5 / multiple) + SEARCHED):
+        height = rows * multiple
+        width = multiple * max(2, ceil(area / height / multiple))
+        candidates.append((abs(log(height / width / aspect)), height * width, height, width))
+    fitting = [found for found in candidates if found[1] <= MAX_EXTRA_AREA * area] or candidates
+    return min(fitting)[2:]
 
 
 def describe_size_rule(multiple: int) -> str:

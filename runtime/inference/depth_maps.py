@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from ..images.png import save_depth_png
-from ..images.resizing import cover_crop
+from ..images.resizing import frame_crop
 from ..system.files import atomic_write
 from ..system.output_names import depth_map_files
 from ..views.batch import ViewBatch
@@ -50,7 +50,7 @@ def write_depth_maps(folder: Path, stems: Sequence[str], prediction: Prediction,
                 far=far,
                 image=original.name,
                 image_size=(original.width, original.height),
-                crop=cover_crop(original.width, original.height, camera.width, camera.height).matrix,
+                crop=frame_crop(original.width, original.height, camera.width, camera.height).matrix,
                 offset=views.offset,
             )
         written += [png, archive]

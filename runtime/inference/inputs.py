@@ -14,10 +14,11 @@ from ..cameras.io import read_cameras
 from ..errors import InputError
 from ..images.arrays import as_uint8_image
 from ..images.finding import describe_unsupported, image_stem
-from ..images.resizing import cover_crop
-from ..images.sizes import nearest_size
+from ..images.resizing import frame_crop
+from ..images.sizes import whole_frame_size
 from ..sfm.estimate import describe_estimate, estimate_cameras
 from ..system.files import scratch_folder
+from ..system.limits import parse_whole_number
 from ..system.progress import working
 from ..views.batch import ViewBatch, build_view_batch, match_images_to_cameras
 from ..views.loader import ImageCameraPair
@@ -26,6 +27,7 @@ from ..views.sources import find_input_images
 from .model_files import ModelFiles
 
 DEFAULT_VIEWS = 2
+ALL = "all"
 # What --select takes beside names and numbers: 0-3 is 0, 1, 2, 3; 0:8:2 is 0, 2, 4, 6, as Python has it.
 RANGE = re.compile(r"([0-9]{1,9})(?:-([0-9]{1,9}))?")
 SLICE = re.compile(r"([0-9]{0,9}):([0-9]{0,9})(?::([0-9]{0,9}))?")
@@ -34,15 +36,23 @@ MIN_SHOWN_AREA = 0.7  # share of an image below which a note says that the rest 
 
 @dataclass(frozen=True)
 class Request:
-    """The arguments of a reconstruction; `reconstruct` documents each field."""
+    """The arguments of a reconstruction, most of which `reconstruct` documents.
+
+    pixels: least area of the images that the network gets; that of its training if larger. default_views: how many to
+    use where neither `views` nor `select` says it; None for all. copy_side: of `ViewBatch.copies`.
+    """
 
     images: Sequence[Path | str | np.ndarray]
     cameras: Path | str | Sequence[Camera] | None = None
     camera_format: CameraFormat | None = None
     focal: str | None = None
     select: str | None = None
-    views: int | None = None
+    views: int | str | None = None  # "all" for all
     size: tuple[int, int] | None = None  # height, width
+    crop: bool = False
+    pixels: int = 0
+    default_views: int | None = DEFAULT_VIEWS
+    copy_side: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,15 +98,16 @@ def read_inputs(request: Request, model: ModelFiles) -> Inputs:
         posed = _posed_images(request, model, folder)
         pairs, notes = posed.pairs, posed.notes
         cameras = [_named_without(folder, image, camera) for image, camera in pairs]
-        height, width = request.size or model.size_for(cameras)
+        height, width = request.size or _network_size(request, model, cameras)
         count = min(posed.wanted or len(pairs), len(pairs))
         model.check_size(max(count, MIN_VIEWS), height, width)
         with working("choosing and reading images"):
-            views = build_view_batch(pairs, count, height, width, skip_damaged=request.select is None)
+            skip = request.select is None
+            views = build_view_batch(pairs, count, height, width, skip_damaged=skip, copy_side=request.copy_side)
     notes += [f"{line}; left out" for line in views.skipped]
-    if request.views and request.views > len(pairs):
+    if isinstance(request.views, int) and request.views > len(pairs):
         notes.append(f"--views {request.views}: all {len(pairs)} images used; there are no more with a camera")
-    notes += _describe_crop(views.cameras[0], height, width, model)
+    notes += _describe_crops(views, height, width, request.crop or request.size is not None)
     if views.selection_reason:
         notes.append(
             f"{count} of {len(pairs)} images used: {', '.join(views.names)}; {views.selection_reason} "
@@ -110,7 +121,7 @@ def _posed_images(request: Request, model: ModelFiles, folder: Path) -> _PosedIm
     arrays = [image for image in request.images if isinstance(image, np.ndarray)]
     given: Path | str | Sequence[Camera] | None = request.cameras
     if arrays:
-        return _PosedImages(_posed_arrays(request, arrays), model.view_count(request.views, len(arrays), None))
+        return _PosedImages(_posed_arrays(request, arrays), _view_count(request, model, len(arrays)))
     items, notes = [Path(image) for image in request.images if not isinstance(image, np.ndarray)], []
     found = None
     if given is None:
@@ -216,16 +227,38 @@ def _numbers(word: str, count: int) -> Sequence[int]:
 
 def _view_count(request: Request, model: ModelFiles, images: int) -> int | None:
     """How many views to use; None for all. Raises InputError where the model does not take as many."""
-    return model.view_count(request.views, images if request.select else None, DEFAULT_VIEWS)
+    asked = parse_views(request.views) if isinstance(request.views, str) else request.views
+    if asked == ALL:
+        return model.view_count(None, images, None)
+    return model.view_count(int(asked) if asked else None, images if request.select else None, request.default_views)
 
 
-def _describe_crop(camera: Camera, height: int, width: int, model: ModelFiles) -> list[str]:
-    """A note on the part of the images that is cropped, if it is large, and on a size that crops less."""
-    crop = cover_crop(camera.width, camera.height, width, height)
-    share = width * height / (crop.width * crop.height)
-    if share >= MIN_SHOWN_AREA:
-        return []
+def parse_views(text: str) -> int | str:
+    """The option --views: a number, or `all`; raises InputError."""
+    count = parse_whole_number(text)
+    if text != ALL and (count is None or count < MIN_VIEWS):
+        raise InputError(f"--views {text[:40]}: expected a number from {MIN_VIEWS}, or {ALL}")
+    return count or ALL
+
+
+def _network_size(request: Request, model: ModelFiles, cameras: Sequence[Camera]) -> tuple[int, int]:
+    """Height and width of the network's input: of the shape that most images have, unless they are to be cropped."""
     own = model.metadata
-    whole = nearest_size(camera.height / camera.width, own.height * own.width, own.size_multiple)
-    remedy = "" if own.fixed_size else f"; --size {whole[0]}x{whole[1]} takes in nearly all"
-    return [f"the middle {height}x{width} of each image is used, {100 * share:.0f} % of it{remedy}"]
+    if own.fixed_size or request.crop:
+        return model.size_for(cameras)
+    aspect = float(np.median([camera.height / camera.width for camera in cameras]))
+    return whole_frame_size(aspect, max(own.height * own.width, request.pixels), own.size_multiple)
+
+
+def _describe_crops(views: ViewBatch, height: int, width: int, asked: bool) -> list[str]:
+    """A note on images of which only the middle is used; asked: whether the user gave the size or asked for a crop."""
+    shares = []
+    for camera in views.cameras:
+        crop = frame_crop(camera.width, camera.height, width, height)
+        shares.append(width * height / (crop.width * crop.height))
+    if min(shares) >= (MIN_SHOWN_AREA if asked else 1):
+        return []
+    cropped = [name for name, share in zip(views.names, shares, strict=True) if share < 1]
+    which = "each image" if len(cropped) == len(shares) else ", ".join(cropped)
+    remedy = "leave out --size and --crop for the whole" if asked else "its shape is not that of the others"
+    return [f"of {which} the middle {height}x{width} is used, {100 * min(shares):.0f} % of it; {remedy}"]

@@ -16,10 +16,13 @@ from ..inference.inputs import Inputs, Request, read_inputs
 from ..inference.model_files import ModelFiles, read_model
 from ..inference.predictor import Predictor
 from ..inference.session import CPU, provider_name
-from ..splats.filtering import FilterOptions, describe_removed, filter_gaussians
+from ..splats.filtering import FilterOptions
 from ..system.progress import CALLBACK, ProgressCallback, reporting_to, working
 from ..views.world_offset import apply_offset, parse_offset
+from .many_views import predict_views
+from .quality import Quality
 from .result import Reconstruction
+from .steps import fuse, make_plan, refine_prediction
 
 LOG = logging.getLogger(__name__)
 
@@ -34,17 +37,22 @@ def reconstruct(
     camera_format: CameraFormat | str | None = None,
     focal: str | None = None,
     select: str | None = None,
-    views: int | None = None,
+    views: int | str | None = None,
     size: tuple[int, int] | None = None,
+    crop: bool = False,
+    quality: Quality | str | None = None,
+    refine: str | None = None,
+    max_gaussians: int = 0,
     near: float | None = None,
     far: float | None = None,
     offset: str | None = None,
     provider: str = CPU,
     filters: FilterOptions | None = None,
     on_inputs: Callable[[Inputs], None] | None = None,
+    on_step: Callable[[int, float], bool] | None = None,
     progress: ProgressCallback | None = None,
 ) -> Reconstruction:
-    """Depth and Gaussians from images, in one forward pass.
+    """Depth and Gaussians from images: predicted, fused over the views, and refined on the images.
 
     images: a folder, a glob, a video, or a sequence of image files; or arrays, RGB [h, w, 3], uint8 in 0 to 255 or
     floating point in [0, 1], together with `cameras` as a sequence.
@@ -52,24 +60,41 @@ def reconstruct(
     for each array, or whose names are those of the image files; "estimate"; or None for the cameras beside the images,
     estimated where there are none (`focal`: focal length in pixels such as "1375", or on 35 mm film such as "26mm").
     model: a .onnx file or staged folder instead of the bundled model. provider: the ONNX Runtime execution provider.
-    select: images to use, as names or numbers ("0-3", "0:8:2"). views: how many of them, by the best baselines; two by
-    default, all that `select` names. size: height and width to work at instead of the trained size.
+    select: images to use, as names or numbers ("0-3", "0:8:2"). views: how many of them, by the best baselines, or
+    "all"; by default as many as the quality says, or all that `select` names.
+    quality: "fast", "standard" or "high" (`quality.PRESETS`); by default standard with the bundled model, and with
+    another one fast, the prediction as it is. refine: instead of the quality's, steps of refinement ("100", "0") or its
+    time ("30s"). max_gaussians: how many to keep at most, those that contribute most; 0 for all.
+    size: height and width to work at instead of the images' own shape. crop: work at the trained size, on the middle of
+    the images.
     near, far: bounds of depth in scene units; found from matched points or the baseline where not given.
     offset: "auto" or "X,Y,Z", subtracted from world coordinates that float32 does not hold.
-    on_inputs: called with the chosen views before the model is loaded; its exceptions propagate.
+    on_inputs: called with the chosen views before the model is loaded; its exceptions propagate. on_step: called with
+    each step of the refinement and its view's PSNR; ends the refinement by returning False.
     progress: receives reports of progress, see `Progress` in `idesplat.runtime.system.progress`.
     Raises InputError for invalid or unreadable inputs.
     """
     _check_depth_bounds(near, far)
     provider_name(provider)
-    filters = filters or FilterOptions()
     parse_offset(offset or "auto")
     with reporting_to(progress or CALLBACK.get()):
         files = model if isinstance(model, ModelFiles) else read_model(model or bundled_model())
+        plan = make_plan(quality, files, refine, filters or FilterOptions(), max_gaussians)
         started = time.perf_counter()
-        given = [images] if isinstance(images, (str, Path)) else list(images)
-        form = CameraFormat(camera_format) if camera_format else None
-        inputs = read_inputs(Request(given, cameras, form, focal, select, views, size), files)
+        request = Request(
+            [images] if isinstance(images, (str, Path)) else list(images),
+            cameras,
+            CameraFormat(camera_format) if camera_format else None,
+            focal,
+            select,
+            views,
+            size,
+            crop,
+            plan.preset.pixels,
+            plan.preset.views,
+            plan.copy_side,
+        )
+        inputs = read_inputs(request, files)
         LOG.info("views %s, cameras %s", ", ".join(inputs.views.names), inputs.source)
         if on_inputs is not None:
             on_inputs(inputs)
@@ -83,23 +108,21 @@ def reconstruct(
         placed, notes = apply_offset(inputs.views, offset, span.near)
         seconds = {"load": predictor.load_seconds, "prepare": prepared - started + time.perf_counter() - loaded}
         with working("predicting depth and Gaussians"):
-            prediction = predictor.predict_views(placed, span.near, span.far)
+            prediction = predict_views(predictor, placed, span)
         LOG.info("predicted in %s", ", ".join(f"{name} {value:.2f} s" for name, value in prediction.seconds.items()))
-        removed: dict[str, int] = {}
-        if filters.enabled:
-            whole = prediction.need_gaussians()
-            kept, removed = filter_gaussians(whole, prediction.depth, placed.extrinsics, placed.intrinsics, filters)
-            prediction = replace(prediction, gaussians=kept)
-            notes.append(describe_removed(removed, len(kept)))
+        seconds |= prediction.seconds
+        fused = fuse(prediction, placed, span, plan.filters)
+        finished = refine_prediction(fused.prediction, placed, plan, on_step)
     return Reconstruction(
-        prediction,
+        finished.prediction,
         replace(inputs, views=placed),
         files,
         span,
-        filters,
-        removed,
-        seconds | prediction.seconds,
-        inputs.notes + notes,
+        plan.filters,
+        fused.removed,
+        seconds | fused.seconds | finished.seconds,
+        inputs.notes + notes + fused.notes + finished.notes,
+        finished.psnr,
     )
 
 

@@ -1,7 +1,7 @@
 """The result of a reconstruction, and its output files."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,7 @@ class Reconstruction:
     prediction: the model's output, with filtered Gaussians. inputs: images, cameras and the chosen views.
     model: the model's files. depth_range: near and far in scene units, and their source.
     filters: the options. removed: number of Gaussians that each filter removed, by name.
-    timings: seconds by step. notes: lines for the user.
+    timings: seconds by step. notes: lines for the user. psnr: of the refinement's views before each of its steps.
     """
 
     prediction: Prediction
@@ -50,6 +50,7 @@ class Reconstruction:
     removed: dict[str, int]
     timings: dict[str, float]
     notes: list[str]
+    psnr: list[float] = field(default_factory=list)
 
     @property
     def gaussians(self) -> Gaussians | None:
@@ -143,5 +144,6 @@ class Reconstruction:
             "seconds": seconds or self.timings,
             "files": [str(path) for path in files],
             "offset": self.views.offset.tolist(),
+            "refinement": {"steps": len(self.psnr), "psnr": self.psnr[-len(self.views.names) :]},
             "filtered": {"asked": asdict(self.filters), "left_out": self.removed},
         }

@@ -28,6 +28,12 @@ class Parameters:
     def __len__(self) -> int:
         return len(self.means)
 
+    def select(self, chosen: np.ndarray) -> "Parameters":
+        """A copy of the Gaussians with these indices."""
+        return Parameters(
+            self.means[chosen], self.quats[chosen], self.log_scales[chosen], self.logits[chosen], self.sh[chosen]
+        )
+
     @property
     def columns(self) -> int:
         """Numbers of one Gaussian."""
@@ -123,6 +129,11 @@ class GradientRasterizer:
 
         self._over_bands(composite_backward, len(done.starts) - 1)
         return gradients
+
+    def contributions(self, done: Pass) -> np.ndarray:
+        """The sum of alpha T over the pixels of a pass, [gaussians]."""
+        weights = self.backward(done, np.zeros_like(done.rgb))[done.entries, kernels.WEIGHT]
+        return np.bincount(done.gaussians, weights, len(self.parameters))
 
     def parameter_gradients(self, done: Pass, gradients: np.ndarray) -> np.ndarray:
         """Gradients of the parameters from those of the entries, float64 [gaussians, columns]."""

@@ -3,55 +3,39 @@
 It starts from a finished scene, such as a feed-forward prediction, and makes some dozens of steps.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..splats.gaussians import Gaussians
 from ..system.progress import progress
 from .losses import photometric_loss
-from .rasterizer import GradientRasterizer, Parameters, Target
+from .options import RefinementOptions
+from .rasterizer import BETA_1, BETA_2, EPSILON, GradientRasterizer, Parameters, Target
 
 MAX_TRANSMITTANCE = 0.5  # of a pixel that counts as covered
-
-
-@dataclass(frozen=True)
-class RefinementOptions:
-    """What a refinement does.
-
-    steps: of the optimiser, one view each. seed: of the order of the views.
-    max_opacity, scale_factor: limit the opacities and enlarge the scales at the start: saturated opacities have almost
-    no gradient, and lower ones leave gaps between splats.
-    ssim_weight: of 1 - SSIM against L1. lr_*: learning rates of Adam; of the means, relative to the median depth.
-    final_lr: what is left of the learning rates at the end, as they decay exponentially.
-    """
-
-    steps: int = 120
-    seed: int = 0
-    max_opacity: float = 0.8
-    scale_factor: float = 1.1
-    ssim_weight: float = 0.2
-    lr_means: float = 2e-4
-    lr_scales: float = 1e-2
-    lr_quats: float = 2e-3
-    lr_opacities: float = 5e-2
-    lr_dc: float = 5e-3
-    lr_sh: float = 1e-3
-    final_lr: float = 0.1
+DEFAULT = RefinementOptions()
+PRUNE_AFTER = 0.6  # of the steps, so that the others make up for what is removed
 
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
     """An image to fit: RGB in [0, 1] float32 [height, width, 3], world-to-camera [4, 4], K in pixels [3, 3].
 
-    weights: of the pixels, [height, width, 1] float32; zero where the camera saw nothing.
+    valid: the pixels to fit, bool [height, width]; not those that the camera did not see.
     """
 
     image: np.ndarray
     viewmat: np.ndarray
     K: np.ndarray
-    weights: np.ndarray
+    valid: np.ndarray
+
+    @property
+    def weights(self) -> np.ndarray:
+        """Of the pixels in the loss, float32 [height, width, 1]."""
+        return self.valid[..., None].astype(np.float32)
 
     @property
     def target(self) -> Target:
@@ -62,10 +46,16 @@ class PosedImage:
 
 @dataclass(eq=False)
 class Refined:
-    """A refined scene. psnr: of the views before their step, one for each step. steps: that were made."""
+    """A refined scene.
+
+    psnr: of the views before their step, one for each step. gains, offsets: of each view and channel, [views, 3]: an
+    image is gain * render + offset.
+    """
 
     gaussians: Gaussians
-    psnr: list[float] = field(default_factory=list)
+    psnr: list[float]
+    gains: np.ndarray
+    offsets: np.ndarray
 
     @property
     def steps(self) -> int:
@@ -76,39 +66,105 @@ class Refined:
 def refine(
     gaussians: Gaussians,
     views: Sequence[PosedImage],
-    options: RefinementOptions = RefinementOptions(),
+    options: RefinementOptions = DEFAULT,
     report: Callable[[int, float], bool] | None = None,
 ) -> Refined:
     """Fit Gaussians to posed images by Adam on (1 - w) L1 + w (1 - SSIM), one view a step.
 
     report: is told the step and the view's PSNR, and stops the refinement by returning False. The result depends on
-    the seed alone, not on the number of threads. Pixels that the scene does not cover at the start have no weight, so
-    that no Gaussian is stretched to fill them.
+    the seed alone, not on the number of threads, unless `options.seconds` ends it. Pixels that the scene does not cover
+    at the start have no weight, so that no Gaussian is stretched to fill them.
     """
-    parameters = _parameters(gaussians, options)
-    rasterizer = GradientRasterizer(parameters)
-    lr = _learning_rates(parameters, _median_depth(parameters, views), options)
-    moments = np.zeros((len(parameters), 2, parameters.columns), np.float32)
-    order = _view_order(len(views), options)
-    views = [_covered(rasterizer, view) for view in progress(views, "finding what the scene covers")]
+    optimiser = _Optimiser(gaussians, views, options)
+    order = _view_order(len(views), options.seed)
     psnr: list[float] = []
-    for step in progress(range(options.steps), "refining"):
-        view = views[order[step]]
-        done = rasterizer.forward(view.target)
-        loss = photometric_loss(done.rgb, view.image, view.weights, options.ssim_weight)
-        psnr.append(_psnr(done.rgb, view))
-        gradients = rasterizer.backward(done, loss.gradient)
-        decay = options.final_lr ** (step / max(options.steps - 1, 1))
-        rasterizer.step(done, gradients, moments, lr * decay, step + 1)
+    started = time.perf_counter()
+    prune_at = int(PRUNE_AFTER * options.steps) if options.max_gaussians else -1
+    for step in progress(range(options.steps), "refining", detail=lambda: f"{psnr[-1]:.1f} dB" if psnr else ""):
+        elapsed = (time.perf_counter() - started) / options.seconds
+        if elapsed >= 1:
+            break
+        if step == prune_at and len(optimiser.parameters) > options.max_gaussians:
+            optimiser.keep(strongest(optimiser.contributions(), options.max_gaussians))
+        lr = options.final_lr ** max(step / max(options.steps - 1, 1), elapsed)
+        psnr.append(optimiser.step(next(order), lr))
         if report is not None and not report(step, psnr[-1]):
             break
-    return Refined(_gaussians(parameters), psnr)
+    contributions = optimiser.contributions()
+    optimiser.keep(strongest(contributions, options.max_gaussians or len(contributions)))
+    return Refined(_gaussians(optimiser.parameters), psnr, optimiser.gains, optimiser.offsets)
+
+
+class _Optimiser:
+    """Gaussians and the views' exposures, with their moments and learning rates."""
+
+    def __init__(self, gaussians: Gaussians, views: Sequence[PosedImage], options: RefinementOptions) -> None:
+        self.options = options
+        self.parameters = _parameters(gaussians, options)
+        self.rasterizer = GradientRasterizer(self.parameters)
+        self.lr = _learning_rates(self.parameters, _median_depth(self.parameters, views), options)
+        self.moments = np.zeros((len(self.parameters), 2, self.parameters.columns), np.float32)
+        self.views = [_covered(self.rasterizer, view) for view in progress(views, "finding what the scene covers")]
+        self.gains, self.offsets = np.ones((len(views), 3)), np.zeros((len(views), 3))
+        self.exposure_moments = np.zeros((len(views), 2, 6))
+        self.visits = np.zeros(len(views), int)
+        self.steps = 0
+
+    def step(self, index: int, lr: float) -> float:
+        """One step on one view, with this factor on all learning rates; the view's PSNR before it."""
+        view = self.views[index]
+        done = self.rasterizer.forward(view.target)
+        gain, offset = (values[index].astype(np.float32) for values in (self.gains, self.offsets))
+        rendered = done.rgb * gain + offset
+        loss = photometric_loss(rendered, view.image, view.weights, self.options.ssim_weight)
+        gradients = self.rasterizer.backward(done, loss.gradient * gain)
+        self.steps += 1
+        self.rasterizer.step(done, gradients, self.moments, self.lr * lr, self.steps)
+        self._step_exposure(index, loss.gradient, done.rgb, lr)
+        return _psnr(rendered, view)
+
+    def contributions(self) -> np.ndarray:
+        """The sum of alpha T over all pixels of all views, [gaussians]; infinite where no view has them in sight."""
+        total = np.zeros(len(self.parameters))
+        seen = np.zeros(len(self.parameters), bool)
+        for view in progress(self.views, "finding what contributes"):
+            done = self.rasterizer.forward(view.target)
+            total += self.rasterizer.contributions(done)
+            seen |= done.boxes[:, 3] > done.boxes[:, 2]
+        return np.where(seen, total, np.inf)
+
+    def keep(self, chosen: np.ndarray) -> None:
+        """Keep the Gaussians with these indices."""
+        if len(chosen) < len(self.parameters):
+            self.parameters = self.parameters.select(chosen)
+            self.moments = self.moments[chosen]
+            self.rasterizer = GradientRasterizer(self.parameters)
+
+    def _step_exposure(self, index: int, for_image: np.ndarray, rgb: np.ndarray, lr: float) -> None:
+        """Adam on a view's gains and offsets. The mean over the views stays 1 and 0: else the scene would drift."""
+        gradient = np.concatenate([(for_image * rgb).sum((0, 1)), for_image.sum((0, 1))]).astype(np.float64)
+        first, second = self.exposure_moments[index]
+        first += (1 - BETA_1) * (gradient - first)
+        second += (1 - BETA_2) * (gradient**2 - second)
+        self.visits[index] += 1
+        count = self.visits[index]
+        update = first / (1 - BETA_1**count) / (np.sqrt(second / (1 - BETA_2**count)) + EPSILON)
+        self.gains[index] -= self.options.lr_exposure * lr * update[:3]
+        self.offsets[index] -= self.options.lr_exposure * lr * update[3:]
+        self.gains /= self.gains.mean(axis=0)
+        self.offsets -= self.offsets.mean(axis=0)
+
+
+def strongest(contributions: np.ndarray, count: int) -> np.ndarray:
+    """The indices of the Gaussians that contribute most, at most `count`, in rising order; none that adds nothing."""
+    order = np.argsort(-contributions, kind="stable")[:count]
+    return np.sort(order[contributions[order] > 0])
 
 
 def _covered(rasterizer: GradientRasterizer, view: PosedImage) -> PosedImage:
-    """The view with weight 0 where less than half of the light is stopped by the scene."""
+    """The view without the pixels where less than half of the light is stopped by the scene."""
     covered = rasterizer.forward(view.target).transmittance < MAX_TRANSMITTANCE
-    return replace(view, weights=view.weights * covered[..., None])
+    return replace(view, valid=view.valid & covered)
 
 
 def _parameters(gaussians: Gaussians, options: RefinementOptions) -> Parameters:
@@ -140,11 +196,11 @@ def _learning_rates(parameters: Parameters, depth: float, options: RefinementOpt
     return lr
 
 
-def _view_order(views: int, options: RefinementOptions) -> list[int]:
+def _view_order(views: int, seed: int) -> Iterator[int]:
     """The view of each step: every view once before any comes again."""
-    generator = np.random.default_rng(options.seed)
-    rounds = -(-options.steps // views)
-    return [int(view) for _ in range(rounds) for view in generator.permutation(views)]
+    generator = np.random.default_rng(seed)
+    while True:
+        yield from generator.permutation(views).tolist()
 
 
 def _psnr(image: np.ndarray, view: PosedImage) -> float:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from ..cameras.camera import Camera, resize_camera
-from ..cameras.undistortion import shrink, undistort, undistortion_valid_mask
+from ..cameras.undistortion import UndistortedImage, undistorted_copy
 from ..errors import InputError, error_context
 from ..geometry.rigid import invert_rigid
 from ..images.io import load_image
@@ -17,19 +17,22 @@ from .refine import PosedImage
 def load_posed_images(pairs: Sequence[tuple[Path, Camera]], max_side: int) -> list[PosedImage]:
     """Read images and shrink them to at most `max_side` pixels on their longer side, keeping their shape.
 
-    Pixels that undistortion takes from outside the image have weight 0.
     Raises InputError if an image cannot be read, or if its size does not match its camera.
     """
     if not pairs:
         raise InputError("no images to refine on; give those that the cameras were made for")
-    return [_load(path, camera, max_side) for path, camera in progress(pairs, "reading images")]
+    copies = [_load(path, camera, max_side) for path, camera in progress(pairs, "reading images")]
+    return [posed_image(copy, copy.camera.extrinsics) for copy in copies]
 
 
-def _load(path: Path, camera: Camera, max_side: int) -> PosedImage:
+def posed_image(copy: UndistortedImage, extrinsics: np.ndarray) -> PosedImage:
+    """A copy of an image as refinement takes it; pixels that the lens did not see have no weight."""
+    image = copy.image.astype(np.float32) / 255
+    return PosedImage(image, invert_rigid(extrinsics), copy.camera.K, copy.valid)
+
+
+def _load(path: Path, camera: Camera, max_side: int) -> UndistortedImage:
     image = load_image(path)
     with error_context(str(path)):
         camera = resize_camera(camera, image.shape[1], image.shape[0])
-    image, camera = shrink(image, camera, max_side)
-    weights = undistortion_valid_mask(camera)[..., None].astype(np.float32)
-    image, camera = undistort(image, camera)
-    return PosedImage(image.astype(np.float32) / 255, invert_rigid(camera.extrinsics), camera.K, weights)
+    return undistorted_copy(image, camera, max_side)

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..geometry.consistency import depth_jumps, multi_view_consistency
+from .fusion import MIN_VOTING_VIEWS, find_contradicted
 from .gaussians import Gaussians
 from .merging import find_duplicates, merge_gaussians
 
@@ -24,6 +25,7 @@ class FilterOptions:
         boundaries, where depth maps put points between foreground and background. 0 for no limit.
     min_consistency: those of pixels whose depth is confirmed by a smaller fraction of the other views, 0 to 1; see
         `geometry.consistency.multi_view_consistency`.
+    remove_contradicted: those that other views see through, with three views or more; see `fusion.find_contradicted`.
     merge_duplicates: merge Gaussians that different views predict at the same point of a surface into one.
 
     Raises InputError if a value is out of range.
@@ -33,6 +35,7 @@ class FilterOptions:
     crop_border: int = 0
     max_depth_jump: float = 0.0
     min_consistency: float = 0.0
+    remove_contradicted: bool = False
     merge_duplicates: bool = False
 
     def __post_init__(self) -> None:
@@ -53,12 +56,18 @@ class FilterOptions:
 
 
 def filter_gaussians(
-    gaussians: Gaussians, depth: np.ndarray, extrinsics: np.ndarray, intrinsics: np.ndarray, options: FilterOptions
+    gaussians: Gaussians,
+    depth: np.ndarray,
+    extrinsics: np.ndarray,
+    intrinsics: np.ndarray,
+    options: FilterOptions,
+    voters: list[np.ndarray] | None = None,
 ) -> tuple[Gaussians, dict[str, int]]:
     """The Gaussians that the filters keep, and how many each filter removed, by its name.
 
     gaussians: one for each pixel, ordered by view, row, column. depth: z-depth, [views, height, width]. extrinsics:
-    camera-to-world, OpenCV axes, [views, 4, 4]. intrinsics: normalised by width and height, [views, 3, 3].
+    camera-to-world, OpenCV axes, [views, 4, 4]. intrinsics: normalised by width and height, [views, 3, 3]. voters: the
+    views that may contradict each view, as arrays of indices; by default all others.
     Raises InputError if a border is wider than the images, or no Gaussian is left.
     """
     means = gaussians.means.reshape(*depth.shape, 3)
@@ -74,6 +83,9 @@ def filter_gaussians(
                 kept &= depth_jumps(depth) <= options.max_depth_jump
             case "min_consistency":
                 kept &= multi_view_consistency(means, depth, extrinsics, intrinsics) >= options.min_consistency
+            case "remove_contradicted":
+                if len(depth) >= MIN_VOTING_VIEWS:
+                    kept &= ~find_contradicted(means, depth, extrinsics, intrinsics, voters)
             case "merge_duplicates":
                 representative = find_duplicates(means, depth, kept, extrinsics, intrinsics)
                 gaussians = merge_gaussians(gaussians, representative)
@@ -91,6 +103,7 @@ def describe_removed(removed: dict[str, int], left: int) -> str:
         "crop_border": "at image borders",
         "max_depth_jump": "at depth discontinuities",
         "min_consistency": "not confirmed by other views",
+        "remove_contradicted": "that other views see through",
         "merge_duplicates": "merged into another view's",
     }
     counts = ", ".join(f"{count:,} {words[name]}" for name, count in removed.items())

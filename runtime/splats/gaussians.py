@@ -1,5 +1,6 @@
 """The set of 3D Gaussians that models predict, files hold and the rasteriser renders."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from math import isqrt
 from pathlib import Path
@@ -49,6 +50,12 @@ class Gaussians:
     def select(self, index: np.ndarray) -> "Gaussians":
         """The Gaussians at a mask or at indices, in their order."""
         return Gaussians(*(getattr(self, field.name)[index] for field in fields(self)))
+
+    @staticmethod
+    def concatenate(parts: "Sequence[Gaussians]") -> "Gaussians":
+        """All Gaussians of several sets of one SH degree, in their order."""
+        names = [field.name for field in fields(Gaussians)]
+        return Gaussians(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
     @property
     def sh_degree(self) -> int:

@@ -22,6 +22,7 @@ class Progress:
     done: int
     total: int | None
     ended: bool = False
+    detail: str = ""
 
 
 ProgressCallback = Callable[[Progress], None]
@@ -39,8 +40,13 @@ def reporting_to(callback: ProgressCallback | None) -> Iterator[None]:
         CALLBACK.reset(token)
 
 
-def progress(items: Iterable[T], description: str, total: int | None = None) -> Iterator[T]:
-    """Yield the items, and report each; total: how many there are, where `items` has no length."""
+def progress(
+    items: Iterable[T], description: str, total: int | None = None, detail: Callable[[], str] = str
+) -> Iterator[T]:
+    """Yield the items, and report each.
+
+    total: how many there are, where `items` has no length. detail: gives what is worth showing of the state.
+    """
     callback = CALLBACK.get()
     if callback is None:
         yield from items
@@ -53,7 +59,7 @@ def progress(items: Iterable[T], description: str, total: int | None = None) -> 
         for item in items:
             yield item
             done += 1
-            callback(Progress(description, done, total))
+            callback(Progress(description, done, total, detail=detail()))
     finally:
         callback(Progress(description, done, total, ended=True))
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..cameras.camera import Camera
+from ..cameras.undistortion import UndistortedImage
 from ..errors import InputError, error_context
 from ..geometry.baselines import nearest_neighbor_pairs, pairwise_baselines
 from ..geometry.intrinsics import check_intrinsics
@@ -43,6 +44,7 @@ class ViewBatch:
     offset: subtracted from the input's world coordinates, float64 [3]; see `world_offset`.
     feature_images: the images for feature extraction, [views]; empty where every camera has a depth range.
     skipped: a line for each image that could not be read and was left out.
+    copies: of the images for refinement, [views]; empty if not asked for.
     """
 
     names: list[str]
@@ -54,6 +56,7 @@ class ViewBatch:
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
     feature_images: Sequence[FeatureImage] = ()
     skipped: Sequence[str] = ()
+    copies: Sequence[UndistortedImage] = ()
 
 
 def match_images_to_cameras(images: Sequence[Path], cameras: Sequence[Camera]) -> list[tuple[Path, Camera]]:
@@ -89,17 +92,23 @@ def match_images_to_cameras(images: Sequence[Path], cameras: Sequence[Camera]) -
 
 
 def build_view_batch(
-    pairs: Sequence[ImageCameraPair], count: int | None, height: int, width: int, skip_damaged: bool = False
+    pairs: Sequence[ImageCameraPair],
+    count: int | None,
+    height: int,
+    width: int,
+    skip_damaged: bool = False,
+    copy_side: int = 0,
 ) -> ViewBatch:
     """Load views, undistorted and resized to height x width.
 
     pairs: images, as files or uint8 RGB [h, w, 3], with their cameras. Each image that is needed is read once.
     count: select this many views; all by default.
     skip_damaged: leave out images that cannot be read, and list them in `ViewBatch.skipped`.
+    copy_side: longer side of `ViewBatch.copies` in pixels; 0 for none.
     Raises InputError for fewer than two views, two cameras with the same pose, cameras without a baseline, or an image
     that cannot be read or whose size does not match its camera.
     """
-    loader = ViewLoader(pairs, height, width)
+    loader = ViewLoader(pairs, height, width, copy_side)
     usable = list(range(len(pairs)))
     skipped: list[str] = []
     while True:
@@ -136,6 +145,7 @@ def _build(loader: ViewLoader, usable: Sequence[int], count: int | None, skipped
         selection_reason,
         feature_images=feature_images if len(feature_images) == len(loaded) else (),
         skipped=skipped,
+        copies=[view.copy for view in loaded if view.copy is not None],
     )
 
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from ..cameras.camera import Camera, resize_camera
-from ..cameras.undistortion import shrink, undistort
+from ..cameras.undistortion import UndistortedImage, shrink, undistort, undistorted_copy
 from ..errors import error_context
 from ..images.io import load_image
 from ..images.resizing import resize_and_crop
@@ -44,31 +44,34 @@ class LoadedView:
 
     image: float32 RGB in [0, 1], [3, height, width]. intrinsics: normalised, float32 [3, 3].
     camera: undistorted, at the image's full size.
-    feature_image: None if no features are needed.
+    feature_image: None if no features are needed. copy: at another size, for refinement; None if not needed.
     """
 
     image: np.ndarray
     intrinsics: np.ndarray
     camera: Camera
     feature_image: FeatureImage | None
+    copy: UndistortedImage | None = None
 
 
 class ViewLoader:
     """Loads views when they are first needed, and keeps them.
 
     height, width: of the network's input; images are resized by `resize_and_crop`. Feature images are made unless all
-    cameras have a depth range.
+    cameras have a depth range. copy_side: longer side of the copies for refinement, in pixels; 0 for none.
     """
 
-    def __init__(self, pairs: Sequence[ImageCameraPair], height: int, width: int) -> None:
-        self.pairs, self.height, self.width = pairs, height, width
+    def __init__(self, pairs: Sequence[ImageCameraPair], height: int, width: int, copy_side: int = 0) -> None:
+        self.pairs, self.height, self.width, self.copy_side = pairs, height, width, copy_side
         self._with_features = any(camera.depth_range is None for _, camera in pairs)
         self._loaded: dict[int, LoadedView] = {}
 
     def load(self, index: int) -> LoadedView:
         """The view of one of the pairs. Raises InputError as `load_view`."""
         if index not in self._loaded:
-            self._loaded[index] = load_view(self.pairs[index], self.height, self.width, self._with_features)
+            self._loaded[index] = load_view(
+                self.pairs[index], self.height, self.width, self._with_features, self.copy_side
+            )
         return self._loaded[index]
 
     def feature_image(self, index: int) -> FeatureImage:
@@ -78,8 +81,10 @@ class ViewLoader:
         return feature_image
 
 
-def load_view(pair: ImageCameraPair, height: int, width: int, with_features: bool = False) -> LoadedView:
-    """Read one image, undistort it, and resize and crop it to height x width.
+def load_view(
+    pair: ImageCameraPair, height: int, width: int, with_features: bool = False, copy_side: int = 0
+) -> LoadedView:
+    """Read one image, undistort it, and resize it to height x width (`resize_and_crop`).
 
     Raises InputError if it cannot be read, or if its size does not match its camera.
     """
@@ -88,5 +93,6 @@ def load_view(pair: ImageCameraPair, height: int, width: int, with_features: boo
     with error_context(camera.name):
         camera = resize_camera(camera, image.shape[1], image.shape[0])
     feature_image = FeatureImage(image, camera) if with_features else None
+    copy = undistorted_copy(image, camera, copy_side) if copy_side else None
     image, camera = undistort(image, camera)
-    return LoadedView(*resize_and_crop(image, camera.K, height, width), camera, feature_image)
+    return LoadedView(*resize_and_crop(image, camera.K, height, width), camera, feature_image, copy)

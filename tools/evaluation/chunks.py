@@ -202,4 +202,6 @@ def _fitted(image: np.ndarray, K: np.ndarray, height: int, width: int) -> tuple[
     full_height, full_width = image.shape[:2]
     crop = cover_crop(full_width, full_height, width, height)
     scaled = Image.fromarray(image).resize((crop.width, crop.height), Image.Resampling.LANCZOS)
-    return resize_and_crop(np.asarray(scaled), denormalize_intrinsics(K, crop.width, crop.height), height, width)
+    K_scaled = denormalize_intrinsics(K, crop.width, crop.height)
+    middle = cover_crop(crop.width, crop.height, width, height)
+    return resize_and_crop(np.asarray(scaled), K_scaled, height, width, middle)

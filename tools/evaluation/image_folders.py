@@ -13,7 +13,7 @@ from ...runtime.cameras.undistortion import undistortion_valid_mask
 from ...runtime.errors import InputError
 from ...runtime.images.header import image_size
 from ...runtime.images.io import load_image
-from ...runtime.images.resizing import cover_crop
+from ...runtime.images.resizing import frame_crop
 from ...runtime.system.files import check_regular
 from ...runtime.views.batch import ViewBatch, build_view_batch
 from ...runtime.views.depth_range import DepthRange
@@ -133,7 +133,7 @@ def valid_pixels(image: np.ndarray, camera: Camera, height: int, width: int) -> 
         seen = ~_black_border(image)
     else:
         seen = undistortion_valid_mask(resize_camera(camera, image.shape[1], image.shape[0]))
-    crop = cover_crop(image.shape[1], image.shape[0], width, height)
+    crop = frame_crop(image.shape[1], image.shape[0], width, height)
     interpolation = cv2.INTER_AREA if crop.scale_x < 1 else cv2.INTER_LINEAR
     share = cv2.resize(seen.astype(np.float32), (crop.width, crop.height), interpolation=interpolation)
     whole = (share[crop.top : crop.top + height, crop.left : crop.left + width] > 0.999).astype(np.uint8)
@@ -154,7 +154,7 @@ def _fitted_depth(folder: Path, path: Path, camera: Camera, height: int, width: 
     if camera.distortion is not None:
         raise InputError(f"{path}: has lens distortion; true depth can only be compared for undistorted images")
     depth = _read_depth(folder / f"{path.stem}.npz", path)
-    crop = cover_crop(depth.shape[1], depth.shape[0], width, height)
+    crop = frame_crop(depth.shape[1], depth.shape[0], width, height)
     rows = np.floor((np.arange(height) + 0.5 + crop.top) / crop.scale_y).astype(int)
     columns = np.floor((np.arange(width) + 0.5 + crop.left) / crop.scale_x).astype(int)
     return depth[rows][:, columns]

@@ -1,5 +1,7 @@
 """Refinement: it brings a scene closer to its images, depends on the seed alone, and stops when told to."""
 
+from dataclasses import fields, replace
+
 import numpy as np
 import pytest
 from idesplat.runtime.refinement.rasterizer import GradientRasterizer, Parameters
@@ -31,8 +33,7 @@ def views() -> list[PosedImage]:
         extrinsics = np.eye(4)
         extrinsics[0, 3] = x
         image = render_view(scene(0), extrinsics, K, SIZE, SIZE).rgb
-        weights = np.ones((SIZE, SIZE, 1), np.float32)
-        images.append(PosedImage(image, np.linalg.inv(extrinsics), K, weights))
+        images.append(PosedImage(image, np.linalg.inv(extrinsics), K, np.ones((SIZE, SIZE), bool)))
     return images
 
 
@@ -71,7 +72,7 @@ def test_stops_when_told_to_and_leaves_its_input_alone(views: list[PosedImage], 
 
 
 def test_pixels_without_weight_have_no_effect(views: list[PosedImage], wrong_colours: Gaussians) -> None:
-    ignored = [PosedImage(view.image, view.viewmat, view.K, np.zeros_like(view.weights)) for view in views]
+    ignored = [PosedImage(view.image, view.viewmat, view.K, np.zeros_like(view.valid)) for view in views]
     refined = refine(wrong_colours, ignored, RefinementOptions(steps=6))
     np.testing.assert_array_equal(refined.gaussians.sh, wrong_colours.sh)
 
@@ -83,6 +84,33 @@ def test_no_gaussian_is_stretched_over_what_the_scene_does_not_cover(views: list
     refined = refine(half, views, RefinementOptions(steps=60, scale_factor=1, max_opacity=1 - 1e-6)).gaussians
     before, after = (render_view(each, np.eye(4), K, SIZE, SIZE).alpha for each in (half, refined))
     assert after[:, 24:].max() < 0.2 and (after > 0.5).mean() < (before > 0.5).mean() + 0.03
+
+
+def test_the_exposure_of_a_view_is_found(views: list[PosedImage]) -> None:
+    """An image that is darker and bluer than the others changes its own exposure, not the scene's colours."""
+    gain = np.float32([0.7, 0.8, 0.9])
+    exposed = [replace(views[0], image=views[0].image * gain), *views[1:]]
+    options = RefinementOptions(steps=300, scale_factor=1, max_opacity=0.9, lr_exposure=1e-2, lr_dc=1e-3)
+    refined = refine(scene(0), exposed, options)
+    colour = views[0].image.mean(axis=(0, 1))
+    first, others = (refined.gains[part] * colour + refined.offsets[part] for part in (0, slice(1, None)))
+    np.testing.assert_allclose(first / others.mean(axis=0), gain, atol=0.03)
+    np.testing.assert_allclose(refined.gains.mean(axis=0), 1, atol=1e-6)
+    fixed = refine(scene(0), exposed, replace(options, lr_exposure=0))
+    assert np.mean(refined.psnr[-3:]) > np.mean(fixed.psnr[-3:]) + 6
+
+
+def test_the_strongest_gaussians_are_kept(views: list[PosedImage]) -> None:
+    """Half of the Gaussians lie hidden behind an opaque wall; these go first, and what is seen stays."""
+    front = scene(0)
+    opacities, scales = np.full(len(front), 0.99, np.float32), np.full((len(front), 3), 0.3, np.float32)
+    wall = replace(front, opacities=opacities, scales=scales)
+    hidden = replace(front, means=front.means + np.float32([0, 0, 6]))
+    both = Gaussians(*(np.concatenate([getattr(part, f.name) for part in (hidden, wall)]) for f in fields(wall)))
+    options = RefinementOptions(steps=10, max_opacity=0.99, max_gaussians=len(front))
+    refined = refine(both, views, options).gaussians
+    assert 0 < len(refined) <= len(front)
+    assert (refined.means[:, 2] < 6).mean() > 0.99
 
 
 def test_gaussians_that_no_view_sees_stay(views: list[PosedImage], wrong_colours: Gaussians) -> None:
@@ -111,5 +139,5 @@ def test_gaussians_that_no_view_sees_stay(views: list[PosedImage], wrong_colours
 
 def test_an_empty_scene_renders_as_nothing() -> None:
     empty = Parameters(*(np.zeros((0, *shape), np.float32) for shape in ((3,), (4,), (3,), (), (1, 3))))
-    view = PosedImage(np.zeros((8, 8, 3), np.float32), np.eye(4), K, np.ones((8, 8, 1), np.float32))
+    view = PosedImage(np.zeros((8, 8, 3), np.float32), np.eye(4), K, np.ones((8, 8), bool))
     assert not GradientRasterizer(empty).forward(view.target).rgb.any()

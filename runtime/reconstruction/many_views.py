@@ -1,0 +1,74 @@
+"""Prediction for any number of views, in groups that fit the memory."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..inference.predictor import Prediction, Predictor
+from ..splats.gaussians import Gaussians
+from ..system.progress import progress
+from ..views.batch import ViewBatch
+from ..views.depth_range import DepthRange
+from ..views.groups import group_views, nearest_views
+
+# Pixels of all views that the network gets together: about 2 GB of memory with the bundled model.
+GROUP_PIXELS = 600_000
+MIN_GROUP = 3  # views
+# Views that vote on a view's points. More cost time, and see less of the same.
+VOTERS = 8
+
+
+def predict_views(predictor: Predictor, views: ViewBatch, span: DepthRange) -> Prediction:
+    """Depth and Gaussians of all views, each predicted once, beside the views that suit it best."""
+    height, width = views.images.shape[2:]
+    size = max(MIN_GROUP, GROUP_PIXELS // (height * width))
+    groups = group_views(views.cameras, _middle_depths(views, span), size)
+    if len(groups) == 1:
+        return predictor.predict_views(views, span.near, span.far)
+    parts: dict[int, Prediction] = {}
+    seconds: dict[str, float] = {}
+    for group in progress(groups, "predicting groups of views"):
+        prediction = predictor.predict_views(_subset(views, group.views), span.near, span.far)
+        for name, value in prediction.seconds.items():
+            seconds[name] = seconds.get(name, 0) + value
+        parts |= {view: _of_view(prediction, group.views.index(view)) for view in group.used}
+    ordered = [parts[view] for view in range(len(views.names))]
+    gaussians = [part.gaussians for part in ordered if part.gaussians is not None]
+    return Prediction(
+        np.concatenate([part.depth for part in ordered]),
+        Gaussians.concatenate(gaussians) if gaussians else None,
+        seconds,
+        [part.cameras[0] for part in ordered],
+    )
+
+
+def voting_views(views: ViewBatch, span: DepthRange) -> list[np.ndarray]:
+    """For each view, the others that see most of the same, as indices."""
+    return nearest_views(views.cameras, _middle_depths(views, span), VOTERS)
+
+
+def _middle_depths(views: ViewBatch, span: DepthRange) -> np.ndarray:
+    return np.full(len(views.names), np.sqrt(span.near * span.far))
+
+
+def _subset(views: ViewBatch, chosen: Sequence[int]) -> ViewBatch:
+    index = list(chosen)
+    return replace(
+        views,
+        names=[views.names[view] for view in index],
+        images=views.images[index],
+        extrinsics=views.extrinsics[index],
+        intrinsics=views.intrinsics[index],
+        cameras=[views.cameras[view] for view in index],
+        feature_images=[views.feature_images[view] for view in index] if views.feature_images else (),
+        copies=(),
+    )
+
+
+def _of_view(prediction: Prediction, view: int) -> Prediction:
+    """The part of one view."""
+    gaussians = prediction.gaussians
+    pixels = prediction.depth[view].size
+    own = None if gaussians is None else gaussians.select(np.arange(view * pixels, (view + 1) * pixels))
+    return Prediction(prediction.depth[view : view + 1], own, {}, [prediction.cameras[view]])

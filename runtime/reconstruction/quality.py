@@ -1,0 +1,62 @@
+"""Quality presets: how many views and pixels a reconstruction uses, and how long it is refined."""
+
+import re
+from dataclasses import dataclass
+from enum import StrEnum
+
+from ..errors import InputError
+
+STEPS_OR_SECONDS = re.compile(r"([0-9]{1,6})(s?)")
+MAX_STEPS = 100_000
+COPY_SIDE = 384
+
+
+class Quality(StrEnum):
+    """The names of the presets."""
+
+    FAST = "fast"
+    STANDARD = "standard"
+    HIGH = "high"
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A trade of time for quality.
+
+    views: how many images are used where neither --views nor --select says it. pixels: least area of the images that
+    the network gets; that of its training if larger. fuse: whether Gaussians that other views see through are removed.
+    steps_per_view, seconds: of the refinement, whichever ends first; no steps for none. copy_side: longer side of the
+    images that it fits, in pixels.
+    """
+
+    views: int
+    pixels: int
+    fuse: bool
+    steps_per_view: int
+    seconds: float
+    copy_side: int
+
+
+PRESETS = {
+    Quality.FAST: Preset(views=2, pixels=0, fuse=False, steps_per_view=0, seconds=0, copy_side=COPY_SIDE),
+    Quality.STANDARD: Preset(views=8, pixels=0, fuse=True, steps_per_view=15, seconds=40, copy_side=COPY_SIDE),
+    Quality.HIGH: Preset(views=24, pixels=1 << 17, fuse=True, steps_per_view=30, seconds=240, copy_side=640),
+}
+
+
+@dataclass(frozen=True)
+class RefinementLimit:
+    """When a refinement ends: after so many steps, None for as many as suit the views, or seconds."""
+
+    steps: int | None
+    seconds: float = float("inf")
+
+
+def parse_refine(text: str) -> RefinementLimit:
+    """The option --refine: a number of steps, 0 for none, or a time such as `30s`; raises InputError."""
+    found = STEPS_OR_SECONDS.fullmatch(text.strip())
+    if found is None or (found[2] and not int(found[1])) or (not found[2] and int(found[1]) > MAX_STEPS):
+        raise InputError(
+            f"--refine {text[:40]}: expected a number of steps up to {MAX_STEPS}, 0 for none, or a time such as 30s"
+        )
+    return RefinementLimit(None, float(found[1])) if found[2] else RefinementLimit(int(found[1]))

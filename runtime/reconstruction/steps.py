@@ -1,0 +1,112 @@
+"""The steps of a reconstruction after the prediction: fusion of the views, and refinement on their images."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ..errors import InputError
+from ..inference.bundled_model import bundled_model
+from ..inference.model_files import ModelFiles
+from ..inference.predictor import Prediction
+from ..refinement.options import RefinementOptions, default_steps, options_for
+from ..refinement.refine import refine
+from ..refinement.views import posed_image
+from ..splats.filtering import FilterOptions, describe_removed, filter_gaussians
+from ..views.batch import ViewBatch
+from ..views.depth_range import DepthRange
+from .many_views import voting_views
+from .quality import PRESETS, Preset, Quality, RefinementLimit, parse_refine
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What happens to a prediction: the quality's preset, the filters, and the limits of the refinement.
+
+    limit: None for the preset's. max_gaussians: to keep; 0 for all. gaussians: whether the model predicts any.
+    """
+
+    preset: Preset
+    filters: FilterOptions
+    limit: RefinementLimit | None
+    max_gaussians: int
+    gaussians: bool
+
+    @property
+    def copy_side(self) -> int:
+        """The longer side of the images to refine on; 0 where there is nothing to do."""
+        steps = self.limit.steps if self.limit else self.preset.steps_per_view
+        return self.preset.copy_side if self.gaussians and (steps or self.max_gaussians) else 0
+
+    def refinement(self, views: int) -> RefinementOptions:
+        """The options of the refinement on so many views."""
+        limit = self.limit or RefinementLimit(None if self.preset.steps_per_view else 0, self.preset.seconds)
+        steps = default_steps(views, self.preset.steps_per_view) if limit.steps is None else limit.steps
+        return options_for(views, steps=steps, seconds=limit.seconds, max_gaussians=self.max_gaussians)
+
+
+@dataclass(frozen=True)
+class Stepped:
+    """A prediction after a step, with what the step has to say. psnr: of the refinement's views before each step."""
+
+    prediction: Prediction
+    removed: dict[str, int] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    psnr: list[float] = field(default_factory=list)
+
+
+def make_plan(
+    quality: Quality | str | None, model: ModelFiles, refine: str | None, filters: FilterOptions, max_gaussians: int
+) -> Plan:
+    """The plan for a quality; by default standard for the bundled model, and for others fast: what they predict.
+
+    Raises InputError for a quality or a refinement that is none.
+    """
+    if quality is not None and quality not in list(Quality):
+        raise InputError(f"--quality {quality}: expected one of {', '.join(Quality)}")
+    if max_gaussians < 0:
+        raise InputError(f"--max-gaussians {max_gaussians}: expected a number of Gaussians, or 0 for all")
+    default = Quality.STANDARD if model.path == bundled_model() else Quality.FAST
+    preset = PRESETS[Quality(quality or default)]
+    if preset.fuse and model.metadata.gaussians:
+        filters = replace(filters, remove_contradicted=True)
+    limit = parse_refine(refine) if refine is not None else None
+    return Plan(preset, filters, limit, max_gaussians, model.metadata.gaussians)
+
+
+def fuse(prediction: Prediction, views: ViewBatch, span: DepthRange, filters: FilterOptions) -> Stepped:
+    """The prediction with the Gaussians that the filters keep."""
+    if not filters.enabled:
+        return Stepped(prediction)
+    started = time.perf_counter()
+    kept, removed = filter_gaussians(
+        prediction.need_gaussians(),
+        prediction.depth,
+        views.extrinsics,
+        views.intrinsics,
+        filters,
+        voting_views(views, span),
+    )
+    notes = [describe_removed(removed, len(kept))] if any(removed.values()) else []
+    return Stepped(replace(prediction, gaussians=kept), removed, {"fuse": time.perf_counter() - started}, notes)
+
+
+def refine_prediction(
+    prediction: Prediction, views: ViewBatch, plan: Plan, on_step: Callable[[int, float], bool] | None
+) -> Stepped:
+    """The prediction with its Gaussians fitted to the views' images, if these were kept for it."""
+    if not views.copies:
+        return Stepped(prediction)
+    started = time.perf_counter()
+    images = [posed_image(copy, pose) for copy, pose in zip(views.copies, views.extrinsics, strict=True)]
+    refined = refine(prediction.need_gaussians(), images, plan.refinement(len(images)), on_step)
+    seconds = time.perf_counter() - started
+    notes = []
+    if refined.steps:
+        first, last = (float(np.mean(part)) for part in (refined.psnr[: len(images)], refined.psnr[-len(images) :]))
+        notes.append(
+            f"refined in {refined.steps} steps, {seconds:.0f} s: PSNR of the input views {first:.1f} to {last:.1f} dB"
+        )
+    return Stepped(replace(prediction, gaussians=refined.gaussians), {}, {"refine": seconds}, notes, refined.psnr)
