@@ -1,5 +1,6 @@
 """The command `idesplat render`: a splat file to images or a video."""
 
+import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -28,7 +29,8 @@ from ..rendering.cameras import (
     overview_camera,
     path_cameras,
 )
-from ..rendering.render import render_view
+from ..rendering.rasterizer import MAX_LENS
+from ..rendering.render import AUTO, SOLID, autofocus, render_view
 from ..rendering.types import Rendering
 from ..splats.gaussians import Gaussians
 from ..splats.io import read_offset, read_splats
@@ -39,11 +41,11 @@ from ..system.progress import progress
 from .input_files import camera_files, named_images, nearby_images
 from .options import Cameras, CamerasFormat, Config, Overwrite, Quiet, Verbose, parse_count
 from .outputs import command
+from .reporting import note
 from .terminal import run, say
 
 COMMAND = "idesplat render"
 COLOUR = ""  # beside DEPTH and ALPHA: the endings of the names of the kinds of images
-SOLID = 0.5  # alpha from which on a pixel has a depth
 SIZE = "360x640"  # without cameras and --size
 MOST_LISTED = 12  # files that are named one by one
 
@@ -77,6 +79,21 @@ def render(
     background: Annotated[
         str, typer.Option(help="Red, green and blue behind the scene, 0 to 1, such as 1,1,1.", metavar="R,G,B")
     ] = "0,0,0",
+    aperture: Annotated[
+        float | None,
+        typer.Option(
+            help="Diameter in scene units of a lens that blurs what is out of focus; a pinhole where not given.",
+            metavar="DIAMETER",
+        ),
+    ] = None,
+    focus: Annotated[
+        str | None,
+        typer.Option(
+            help="Depth in scene units that --aperture leaves sharp, or auto: what the first image has in its middle.",
+            metavar="DISTANCE|auto",
+            show_default=AUTO,
+        ),
+    ] = None,
     overwrite: Overwrite = False,
     config: Config = None,
     verbose: Verbose = 0,
@@ -84,10 +101,11 @@ def render(
 ) -> None:
     """Render a splat file from cameras, on a path through them, in an orbit, or from an overview camera.
 
-    Images are named after the cameras' images and have the cameras' own size. They show the ideal pinhole view: where
-    a camera has lens distortion, compare with the undistorted image.
+    Images are named after the cameras' images and have the cameras' own size. They are without lens distortion: where
+    a camera has it, compare with the undistorted image.
     """
     colour = _parse_background(background)
+    lens = _parse_lens(aperture, focus)
     if not 0 < fps <= 1000:
         raise InputError(f"--fps {fps:g}: expected frames a second, 1 to 1000")
     if not 1 <= frames <= MAX_FRAMES:
@@ -106,7 +124,7 @@ def render(
     views = offset_cameras(views, read_offset(scene))
     trajectory = _choose_cameras(gaussians, views, orbit, path, degrees, frames, size)
     check_image_sizes(trajectory)
-    render_camera = _renderer(gaussians, colour)
+    render_camera = _renderer(gaussians, colour, *_focus(lens, gaussians, trajectory[0]))
     if out.suffix.lower() == VIDEO:
         written = _save_video(render_camera, trajectory, out, fps, kinds)
     else:
@@ -139,6 +157,25 @@ def _parse_background(text: str) -> tuple[float, float, float]:
     if not all(0 <= value <= 1 for value in (red, green, blue)):
         raise InputError(f"--background {text}: expected red, green and blue from 0 to 1, such as 1,1,1")
     return red, green, blue
+
+
+def _parse_lens(aperture: float | None, focus: str | None) -> tuple[float, float | None]:
+    """The options --aperture and --focus, the latter None for auto; raises InputError."""
+    if aperture is None:
+        if focus is not None:
+            raise InputError(f"--focus {focus}: needs a lens; give its diameter in scene units as --aperture")
+        return 0.0, None
+    if not 0 <= aperture <= MAX_LENS:
+        raise InputError(f"--aperture {aperture:g}: expected the lens's diameter in scene units, 0 to {MAX_LENS:g}")
+    if focus is None or focus == AUTO:
+        return aperture, None
+    try:
+        distance = float(focus)
+    except ValueError:
+        distance = math.nan
+    if not distance >= 1 / MAX_LENS:
+        raise InputError(f"--focus {focus}: expected a distance in scene units above 0, or {AUTO}")
+    return aperture, distance
 
 
 def _announce(
@@ -196,9 +233,24 @@ def _choose_cameras(
     return list(views) or [overview_camera(gaussians, *parse_size(size or SIZE))]
 
 
-def _renderer(gaussians: Gaussians, background: tuple[float, float, float]) -> Callable[[Camera], Rendering]:
+def _focus(lens: tuple[float, float | None], gaussians: Gaussians, first: Camera) -> tuple[float, float | None]:
+    """The aperture and the distance in focus, chosen with the first camera where None is given, and noted."""
+    aperture, distance = lens
+    if not aperture:
+        return lens
+    chosen = "" if distance is not None else f", the median depth in the middle of the first image ({first.name})"
+    distance = autofocus(gaussians, first) if distance is None else distance
+    farthest = aperture * first.K[0, 0] / distance
+    note(f"in focus at {distance:.4g}{chosen}; what is far behind is blurred over {farthest:.3g} pixels")
+    return aperture, distance
+
+
+def _renderer(
+    gaussians: Gaussians, background: tuple[float, float, float], aperture: float, focus: float | None
+) -> Callable[[Camera], Rendering]:
     def render_camera(camera: Camera) -> Rendering:
-        return render_view(gaussians, camera.extrinsics, camera.K, camera.width, camera.height, background)
+        size = camera.width, camera.height
+        return render_view(gaussians, camera.extrinsics, camera.K, *size, background, aperture, focus)
 
     return render_camera
 

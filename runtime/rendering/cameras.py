@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..geometry.trajectories import interpolate_extrinsics, orbit_extrinsics
 from ..splats.gaussians import Gaussians
 from ..system.output_names import frame_names
-from .render import render_view
+from .render import median_depth, render_view
 
 OVERVIEW_FOV = math.radians(60)  # of the shorter side
 MIN_OPACITY = 0.1  # of Gaussians that count as part of the scene
@@ -21,7 +21,6 @@ OUTLIERS = 5  # percent of the scene at either end of an axis that may lie outsi
 SCENE_ORBIT_DEG = 360.0  # of an orbit from the overview
 CAMERA_ORBIT_DEG = 30.0  # of an orbit about what cameras look at: none of them has seen its back
 FOCUS_SIDE = 96  # pixels, longer side of the rendering that `focus_depth` measures
-FOCUS_ALPHA = 0.5
 OVERVIEW_NAME = "still"
 MAX_FRAMES = 10_000  # of a path or an orbit: five minutes of video at 30 frames a second, and numbers of four digits
 MAX_PIXELS = 1 << 26  # of an image; 8K has half as many
@@ -81,17 +80,17 @@ def fit_camera(camera: Camera, height: int, width: int) -> Camera:
 
 
 def focus_depth(gaussians: Gaussians, camera: Camera) -> float:
-    """Median depth of what the camera sees, in world units, over the pixels with alpha >= FOCUS_ALPHA.
+    """Median depth of what the camera sees, in world units, over the pixels with alpha >= `render.SOLID`.
 
     Raises InputError if there are none.
     """
     factor = FOCUS_SIDE / max(camera.width, camera.height)
     small = fit_camera(camera, max(round(camera.height * factor), 1), max(round(camera.width * factor), 1))
     rendering = render_view(gaussians, small.extrinsics, small.K, small.width, small.height)
-    covered = rendering.alpha >= FOCUS_ALPHA
-    if not covered.any():
+    depth = median_depth(rendering)
+    if depth is None:
         raise InputError(f"the camera {camera.name} sees nothing of the scene; give the cameras that belong to it")
-    return float(np.median(rendering.depth[covered] / rendering.alpha[covered]))
+    return depth
 
 
 def check_image_sizes(cameras: Sequence[Camera]) -> None:

@@ -11,7 +11,7 @@ import functools
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from math import ceil
+from math import ceil, inf
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
@@ -24,6 +24,7 @@ from .types import BLOCK_SIZE, GaussianArrays, Rendering, Splats, View
 MAX_BAND_PIXELS = 1 << 16
 MAX_PIXELS = 1 << 27  # 20 bytes each, and as much again while the results are put together
 MIN_BANDS = 8  # several for each core, so that the cores finish together
+MAX_LENS = 1e30  # of the aperture and of 1 / focus, in world units and their inverse: squares do not overflow
 MAX_THREADS = 8  # each holds the fragments of a chunk, some 30 MB
 
 
@@ -39,18 +40,24 @@ def rasterize(
     height: int,
     background: tuple[float, float, float] | np.ndarray = (0, 0, 0),
     near: float = 0.01,
+    aperture: float = 0,
+    focus: float | None = None,
 ) -> Rendering:
-    """Render Gaussians from a pinhole camera, with gsplat's arithmetic.
+    """Render Gaussians from a pinhole camera, with gsplat's arithmetic, or through a thin lens.
 
     means and scales (standard deviations) are in world units, quats are wxyz and need not be normalised, opacities lie
     in [0, 1], sh is in the basis of 3DGS, degree 0 to 3. viewmat is world-to-camera (OpenCV axes: x right, y down, z
     forward) and rigid; K is in pixels, with pixel centres at .5. Gaussians whose z-depth is not above `near`, in world
     units, are skipped.
 
-    Raises InputError if an argument has the wrong shape, is not finite, or is not a pinhole camera.
+    aperture: diameter of the lens in world units, 0 for a pinhole. focus: z-depth of the plane in focus in world units,
+    needed where aperture is above 0. What lies at the z-depth z is blurred over aperture * f * |1 / focus - 1 / z|
+    pixels, f being K's focal length (`geometry.projection`); alpha and depth are those of the blurred image.
+
+    Raises InputError if an argument has the wrong shape, is not finite, or is not a pinhole camera or lens.
     """
     gaussians = _checked_gaussians(means, quats, scales, opacities, sh)
-    view = _checked_view(viewmat, K, width, height, near)
+    view = _checked_view(viewmat, K, width, height, near, *_checked_lens(aperture, focus))
     backdrop = _checked("background", background, (3,))
 
     project, composite_band = _kernels()
@@ -109,7 +116,22 @@ def _checked_gaussians(
     )
 
 
-def _checked_view(viewmat: np.ndarray, K: np.ndarray, width: int, height: int, near: float) -> View:
+def _checked_lens(aperture: float, focus: float | None) -> tuple[float, float]:
+    """The diameter of the lens and the distance in focus, once they are those of a lens."""
+    if not 0 <= aperture <= MAX_LENS:
+        raise InputError(f"rasterize: aperture is {aperture}, expected a diameter in world units, 0 to {MAX_LENS:g}")
+    if focus is None:
+        if aperture > 0:
+            raise InputError("rasterize: focus is missing; give the z-depth of the plane in focus, in world units")
+        return 0.0, inf
+    if not focus >= 1 / MAX_LENS:
+        raise InputError(f"rasterize: focus is {focus}, expected a positive z-depth in world units")
+    return float(aperture), float(focus)
+
+
+def _checked_view(
+    viewmat: np.ndarray, K: np.ndarray, width: int, height: int, near: float, aperture: float, focus: float
+) -> View:
     """The camera, once it is a pinhole camera whose image can be rendered."""
     if not (1 <= width <= MAX_BAND_PIXELS and 1 <= height <= MAX_BAND_PIXELS):
         raise InputError(f"rasterize: the image is {width}x{height}, expected sides of 1 to {MAX_BAND_PIXELS} pixels")
@@ -124,7 +146,7 @@ def _checked_view(viewmat: np.ndarray, K: np.ndarray, width: int, height: int, n
         raise InputError(
             f"rasterize: K is {K.tolist()}, expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels with fx, fy > 0"
         )
-    return View(viewmat, K, width, height, near)
+    return View(viewmat, K, width, height, near, aperture, focus)
 
 
 def _checked(name: str, value: ArrayLike, shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> np.ndarray:

@@ -12,7 +12,7 @@ from math import exp, log
 import numba
 import numpy as np
 
-from ..geometry.projection import EPS2D, FOV_MARGIN
+from ..geometry.projection import DISC_STD, EPS2D, FOV_MARGIN
 from ..geometry.sh import SH_0, SH_1, SH_2, SH_3
 from .types import BLOCK_SIZE, MAX_ALPHA, MIN_ALPHA, MIN_LOG_TRANSMITTANCE, GaussianArrays, Splats, View
 
@@ -29,9 +29,9 @@ def project(gaussians: GaussianArrays, start: int, view: View) -> Splats:
     """Project the block of Gaussians from `start` on; those that touch the image, in the order given."""
     block = GaussianArrays(*(field[start : start + BLOCK_SIZE] for field in gaussians))
     count = len(block.means)
-    ellipses, spans = np.empty((6, count)), np.empty((3, count), np.int64)
+    ellipses, spans = np.empty((7, count)), np.empty((3, count), np.int64)
     features = np.empty((count, 4), np.float32)
-    _project(*block, *view, ellipses, spans, features)
+    _project(*(*block, *view), ellipses, spans, features)  # unpacked as one: mypy confuses two of different lengths
     splats = Splats._make([*ellipses, *spans, features])
     touching = (splats.rows > 0) & (splats.columns > 0)
     return splats if touching.all() else splats.select(np.flatnonzero(touching))
@@ -56,7 +56,9 @@ def _project(
     width: int,
     height: int,
     near: float,
-    ellipses: np.ndarray,  # [6, gaussians]
+    aperture: float,
+    focus: float,
+    ellipses: np.ndarray,  # [7, gaussians]
     spans: np.ndarray,  # [3, gaussians]
     features: np.ndarray,  # [gaussians, 4]
 ) -> None:
@@ -92,12 +94,15 @@ def _project(
             xx += half_x * half_x
             xy += half_x * half_y
             yy += half_y * half_y
-        x_variance, y_variance = xx + EPS2D, yy + EPS2D
-        shear = xy / y_variance
+        xx, yy = xx + EPS2D, yy + EPS2D
+        blur = DISC_STD * aperture * (1 / focus - 1 / z)
+        x_variance, y_variance = xx + (fx * blur) ** 2, yy + (fy * blur) ** 2
+        _, focused_row_variance = _shear_rows(xx, xy, yy)
+        shear, row_variance = _shear_rows(x_variance, xy, y_variance)
         reach = np.log(np.float64(opacities[index] / MIN_ALPHA_32))
         ellipses[0, index], ellipses[1, index], ellipses[2, index] = x, y, shear
-        ellipses[3, index] = max(x_variance - shear * shear * y_variance, EPS2D)
-        ellipses[4, index], ellipses[5, index] = y_variance, reach
+        ellipses[3, index], ellipses[4, index], ellipses[5, index] = row_variance, y_variance, reach
+        ellipses[6, index] = np.sqrt(min(focused_row_variance / row_variance * (yy / y_variance), 1.0))
         spans[0, index], spans[1, index] = _span(y, np.sqrt(2 * reach * y_variance), height)
         _, spans[2, index] = _span(x, np.sqrt(2 * reach * x_variance), width)
         _fill_basis(means[index], position, basis)
@@ -107,6 +112,13 @@ def _project(
                 colour += basis[coefficient] * sh[index, coefficient, channel]
             features[index, channel] = max(colour, np.float32(0))
         features[index, 3] = z
+
+
+@_compiled()
+def _shear_rows(xx: float, xy: float, yy: float) -> tuple[float, float]:
+    """shear and row_variance of a covariance, as in `Splats`."""
+    shear = xy / yy
+    return shear, max(xx - shear * shear * yy, EPS2D)
 
 
 @_compiled()
@@ -170,6 +182,7 @@ def _composite_band(
     row_variance: np.ndarray,
     y_variance: np.ndarray,
     reach: np.ndarray,
+    opacity_scale: np.ndarray,
     first_row: np.ndarray,
     rows: np.ndarray,
     columns: np.ndarray,
@@ -182,6 +195,7 @@ def _composite_band(
     transmittance = np.ones((band_rows, width))
     still_open = band_rows * width
     for splat in range(len(x)):
+        scale = np.float32(opacity_scale[splat])
         for row in range(max(first_row[splat], top), min(first_row[splat] + rows[splat], top + band_rows)):
             dy = row + 0.5 - y[splat]
             reach_here = max(reach[splat] - dy * dy / (2 * y_variance[splat]), 0.0)
@@ -195,7 +209,7 @@ def _composite_band(
                 if before == ENDED:
                     continue
                 falloff = (distance + np.float32(step)) * sharpness
-                alpha = min(max(np.exp(log_peak - falloff * falloff), MIN_ALPHA_32), MAX_ALPHA_32)
+                alpha = min(max(np.exp(log_peak - falloff * falloff), MIN_ALPHA_32), MAX_ALPHA_32) * scale
                 after = before * (np.float32(1) - alpha)
                 if after <= MIN_TRANSMITTANCE:  # this fragment is skipped, too
                     transmittance[row - top, first + step] = ENDED

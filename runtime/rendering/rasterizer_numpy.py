@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..geometry.projection import EPS2D, project_gaussians
+from ..geometry.projection import EPS2D, defocus_variances, project_gaussians
 from ..geometry.sh import sh_basis
 from .types import BLOCK_SIZE, MAX_ALPHA, MIN_ALPHA, MIN_LOG_TRANSMITTANCE, GaussianArrays, Splats, View
 
@@ -41,16 +41,26 @@ def _ellipses(camera_means: np.ndarray, gaussians: GaussianArrays, view: View) -
     projected = project_gaussians(
         camera_means, gaussians.quats, gaussians.scales, view.viewmat[:3, :3], view.K, view.width, view.height
     )
-    x, y, x_variance, xy, y_variance = projected
-    shear = xy / y_variance
-    # At least EPS2D in exact arithmetic; the difference of two large numbers may be less.
-    row_variance = np.maximum(x_variance - shear * shear * y_variance, EPS2D)
+    x, y, xx, xy, yy = projected
+    blur_x, blur_y = defocus_variances(camera_means[:, 2], view.K, view.aperture, view.focus)
+    x_variance, y_variance = xx + blur_x, yy + blur_y
+    _, focused_row_variance = _shear_rows(xx, xy, yy)
+    shear, row_variance = _shear_rows(x_variance, xy, y_variance)
+    # row_variance * y_variance is the determinant of the covariance.
+    opacity_scale = np.sqrt(np.minimum(focused_row_variance / row_variance * (yy / y_variance), 1))
 
     reach = np.log(gaussians.opacities / MIN_ALPHA, dtype=np.float64)
     first_row, rows = _span(y, np.sqrt(2 * reach * y_variance), view.height)
     _, columns = _span(x, np.sqrt(2 * reach * x_variance), view.width)
     features = np.empty((len(camera_means), 4), np.float32)
-    return Splats(x, y, shear, row_variance, y_variance, reach, first_row, rows, columns, features)
+    return Splats(x, y, shear, row_variance, y_variance, reach, opacity_scale, first_row, rows, columns, features)
+
+
+def _shear_rows(xx: np.ndarray, xy: np.ndarray, yy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """shear and row_variance of covariances, as in `Splats`."""
+    shear = xy / yy
+    # At least EPS2D in exact arithmetic; the difference of two large numbers may be less.
+    return shear, np.maximum(xx - shear * shear * yy, EPS2D)
 
 
 def _span(centre: np.ndarray, half: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
@@ -126,11 +136,12 @@ def _fragments(splats: Splats, width: int, is_open: np.ndarray) -> _Fragments:
     distance = (first + 0.5 - centre).astype(np.float32)
     sharpness = np.sqrt(0.5 / row_variance).astype(np.float32)
     log_peak = (reach + log(MIN_ALPHA)).astype(np.float32)
+    opacity_scale = splats.opacity_scale[owner].astype(np.float32)
 
     row, column = _expand(length)  # [fragments]
     falloff = (distance[row] + column.astype(np.float32)) * sharpness[row]
     alpha = np.exp(log_peak[row] - falloff * falloff)
-    alpha = np.clip(alpha, np.float32(MIN_ALPHA), np.float32(MAX_ALPHA))
+    alpha = np.clip(alpha, np.float32(MIN_ALPHA), np.float32(MAX_ALPHA)) * opacity_scale[row]
     fragments = _Fragments((start[row] + column).astype(np.uint16), owner[row], alpha)
     if any_closed:
         kept = np.flatnonzero(is_open[fragments.pixel])

@@ -7,6 +7,10 @@ Compositing as in 3DGS (Kerbl et al. 2023, eq. 3): over the splats i that cover 
 
 d being the pixel's offset from the splat's centre and Sigma' its 2D covariance (`geometry.projection`). As in gsplat,
 fragments with alpha below MIN_ALPHA are skipped, and a pixel ends before the fragment that would bring T to 1e-4.
+
+A splat out of focus has a larger Sigma', and an alpha that is smaller by its opacity_scale. This factor comes after the
+limits of alpha: a splat ends at the same number of standard deviations as in focus, so that one whose light is spread
+over many pixels does not vanish.
 """
 
 from math import log
@@ -53,6 +57,8 @@ class View(NamedTuple):
     width: int
     height: int
     near: float
+    aperture: float  # diameter of the lens, world units; 0 for a pinhole
+    focus: float  # z-depth of the plane in focus, world units
 
 
 class Splats(NamedTuple):
@@ -69,6 +75,7 @@ class Splats(NamedTuple):
     row_variance: np.ndarray
     y_variance: np.ndarray
     reach: np.ndarray  # log(opacity / MIN_ALPHA): how far the exponent may fall before alpha is below MIN_ALPHA
+    opacity_scale: np.ndarray  # area of the ellipse in focus / area of this one, at most 1
     first_row: np.ndarray  # int64
     rows: np.ndarray  # int64
     columns: np.ndarray  # int64, width of the bounding box of the ellipse

@@ -23,7 +23,7 @@ from idesplat.runtime.images.png import save_depth_png, save_png
 from idesplat.runtime.images.video_writer import open_video
 from idesplat.runtime.rendering.cameras import fit_camera, orbit_cameras, overview_camera
 from idesplat.runtime.rendering.rasterizer import rasterize
-from idesplat.runtime.rendering.render import render_view
+from idesplat.runtime.rendering.render import autofocus, render_view
 from idesplat.runtime.splats.formats.ply import read_ply, write_ply
 from idesplat.runtime.splats.gaussians import Gaussians
 
@@ -367,6 +367,14 @@ def test_a_path_through_the_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (("--out", "a.mp4", "--orbit", "--frames", "0"), "--frames 0: expected 1 to 10000"),
         (("--out", "a.jpg"), "--out a.jpg: expected a folder, or a file that ends in .png or .mp4"),
         (("--out", "a.MOV", "--orbit"), "expected a folder, or a file that ends in .png or .mp4"),
+        (("--out", "out", "--aperture", "-0.1"), "--aperture -0.1: expected the lens's diameter in scene units"),
+        (("--out", "out", "--aperture", "nan"), "--aperture nan: expected the lens's diameter in scene units"),
+        (("--out", "out", "--aperture", "inf"), "--aperture inf: expected the lens's diameter in scene units"),
+        (("--out", "out", "--aperture", "1", "--focus", "0"), "--focus 0: expected a distance in scene units above 0"),
+        (("--out", "out", "--aperture", "1", "--focus", "-2"), "--focus -2: expected a distance"),
+        (("--out", "out", "--aperture", "1", "--focus", "nan"), "--focus nan: expected a distance"),
+        (("--out", "out", "--aperture", "1", "--focus", "far"), "--focus far: expected a distance"),
+        (("--out", "out", "--focus", "2"), "--focus 2: needs a lens; give its diameter in scene units as --aperture"),
     ],
 )
 def test_requests_that_make_no_image(
@@ -380,6 +388,60 @@ def test_requests_that_make_no_image(
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
     assert {path.name for path in tmp_path.iterdir()} == {"scene.ply", "cameras.json"}
+
+
+def test_a_lens_blurs_what_is_out_of_focus(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """--focus auto is the depth of the ball in the middle of the first image, also for the second."""
+    monkeypatch.chdir(tmp_path)
+    ball = a_ball_of_gaussians()
+    write_ply(Path("scene.ply"), ball)
+    cameras = [Camera(name, 40, 30, pinhole(40, 30), pose((0, 0, 0), (1, -2, z))) for name, z in (("a", 0), ("b", -2))]
+    write_cameras(Path("cameras.json"), cameras)
+    distance = autofocus(ball, cameras[0])
+    assert 4 < distance < 5  # the ball's front, about 5 away
+    for options, focus in ((("--focus", "auto"), distance), ((), distance), (("--focus", "7"), 7.0)):
+        arguments = ("scene.ply", "--cameras", "cameras.json", "--aperture", "0.5", *options, "--out", "out")
+        assert run(monkeypatch, *arguments) == 0
+        noted = capsys.readouterr().out.splitlines()[0]
+        chosen = "" if focus == 7 else ", the median depth in the middle of the first image (a)"
+        assert noted == f"in focus at {focus:.4g}{chosen}; what is far behind is blurred over {20 / focus:.3g} pixels"
+        for camera in cameras:
+            expected = render_view(ball, camera.extrinsics, camera.K, 40, 30, aperture=0.5, focus=focus).rgb
+            stored = read_rgb(Path("out") / f"{camera.name}.png")
+            np.testing.assert_allclose(stored, np.clip(expected, 0, 1) * 255, atol=0.6)  # the file rounds opacities
+    assert run(monkeypatch, *arguments, "--quiet") == 0
+    assert "in focus" not in capsys.readouterr().out
+
+
+def test_an_aperture_of_zero_is_the_pinhole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_ply(Path("scene.ply"), a_ball_of_gaussians())
+    assert run(monkeypatch, "scene.ply", "--size", "24x32", "--out", "pinhole.png") == 0
+    for number, options in enumerate(((), ("--focus", "auto"), ("--focus", "2"))):
+        assert (
+            run(monkeypatch, "scene.ply", "--size", "24x32", "--aperture", "0", *options, "--out", f"{number}.png") == 0
+        )
+        assert Path(f"{number}.png").read_bytes() == Path("pinhole.png").read_bytes()
+    assert "in focus" not in capsys.readouterr().out
+
+
+def test_a_lens_with_nothing_to_focus_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_ply(Path("scene.ply"), a_ball_of_gaussians())
+    write_cameras(Path("cameras.json"), [Camera("away", 40, 30, pinhole(40, 30), pose((0, 3, 0), (1, -2, 0)))])
+    arguments = ("scene.ply", "--cameras", "cameras.json", "--aperture", "0.5", "--out", "out")
+    assert run(monkeypatch, *arguments) == 2
+    error = capsys.readouterr().err
+    assert "the camera away has nothing in the middle of its image to focus on; give a focus distance" in error
+    assert error.count("\n") == 1
+    assert not Path("out").exists()
+    assert run(monkeypatch, *arguments, "--focus", "3") == 0
 
 
 def test_cameras_of_an_image_too_large_are_refused(

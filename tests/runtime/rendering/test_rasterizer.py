@@ -26,6 +26,8 @@ STEPS = {
     "compiled": (rasterizer_compiled.project, rasterizer_compiled.composite_band),
 }
 
+LENSES = ({}, {"aperture": 0.2, "focus": 2.0}, {"aperture": 0.05, "focus": np.inf})
+
 
 def use_steps(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.setattr(rasterizer, "_kernels", lambda: STEPS[name])
@@ -64,15 +66,16 @@ def test_matches_gsplat(case: str) -> None:
 
 
 @pytest.mark.parametrize("case", ["random", "feedforward", *range(24)])
-def test_compiled_matches_numpy(case: str | int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("lens", LENSES, ids=str)
+def test_compiled_matches_numpy(case: str | int, lens: dict[str, float], monkeypatch: pytest.MonkeyPatch) -> None:
     if isinstance(case, str):
         scene = reference_case(case)
     else:
         scene = random_scene(np.random.default_rng(1000 + case), splats=500, degree=case % 4)
     use_steps(monkeypatch, "numpy")
-    expected = rasterize(*scene)
+    expected = rasterize(*scene, **lens)
     use_steps(monkeypatch, "compiled")
-    rendered = rasterize(*scene)
+    rendered = rasterize(*scene, **lens)
     for name in Rendering._fields:
         theirs = getattr(expected, name)
         # Depth is in scene units, so its rounding grows with it; the others reach 1.
@@ -111,11 +114,12 @@ def test_depths_are_sorted_as_numpy_sorts_them() -> None:
 
 @pytest.mark.usefixtures("steps")
 @pytest.mark.parametrize("seed", range(24))
-def test_matches_slow_reference(seed: int) -> None:
+@pytest.mark.parametrize("lens", LENSES, ids=str)
+def test_matches_slow_reference(seed: int, lens: dict[str, float]) -> None:
     rng = np.random.default_rng(seed)
     scene = random_scene(rng, splats=int(rng.integers(1, 120)), degree=seed % 4)
-    rendered = rasterize(*scene)
-    expected = slow_rasterize(*scene)
+    rendered = rasterize(*scene, **lens)
+    expected = slow_rasterize(*scene, **lens)
     for name in Rendering._fields:
         # A hundred float32 roundings of numbers up to the farthest depth, 8.
         np.testing.assert_allclose(getattr(rendered, name), expected[name], rtol=0, atol=100 * 8 * 6e-8, err_msg=name)
@@ -188,12 +192,12 @@ def test_needles_and_extremes_stay_finite() -> None:
     scales = 10.0 ** rng.uniform(-30, 30, (60, 3))
     quats = rng.normal(size=(60, 4))
     quats[2] = 0
-    rendered = rasterize(
-        means, quats, scales, rng.uniform(size=60), np.zeros((60, 4, 3)), np.eye(4), pinhole(64, 48), 64, 48
-    )
-    for image in rendered:
-        assert np.isfinite(image).all()
-    assert rendered.alpha.max() <= 1
+    camera = np.eye(4), pinhole(64, 48), 64, 48
+    for lens in ({}, {"aperture": 1e30, "focus": 1e-30}, {"aperture": 1e-30, "focus": 0.01}):
+        rendered = rasterize(means, quats, scales, rng.uniform(size=60), np.zeros((60, 4, 3)), *camera, **lens)
+        for image in rendered:
+            assert np.isfinite(image).all()
+        assert rendered.alpha.max() <= 1
 
 
 @pytest.mark.usefixtures("steps")
@@ -276,6 +280,13 @@ def test_values_that_are_not_finite_are_refused(name: str, value: float) -> None
         ("near", 0.0, "near is 0.0"),
         ("near", np.nan, "near is nan"),
         ("background", (0, 0), "background has shape"),
+        ("aperture", -0.1, "aperture is -0.1, expected a diameter in world units, 0 to"),
+        ("aperture", np.nan, "aperture is nan"),
+        ("aperture", np.inf, "aperture is inf"),
+        ("aperture", 0.1, "focus is missing; give the z-depth"),
+        ("focus", 0.0, "focus is 0.0, expected a positive z-depth"),
+        ("focus", -2.0, "focus is -2.0"),
+        ("focus", np.nan, "focus is nan"),
     ],
 )
 def test_wrong_arguments_are_named(name: str, value: object, message: str) -> None:
@@ -341,6 +352,8 @@ def slow_rasterize(
     width: int,
     height: int,
     background: np.ndarray,
+    aperture: float = 0,
+    focus: float = np.inf,
 ) -> dict[str, np.ndarray]:
     """What `rasterize` computes, one splat after another over the whole image, in float64."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
@@ -360,12 +373,16 @@ def slow_rasterize(
         x_clamped = z * np.clip(x / z, -cx / fx - 0.15 * width / fx, (width - cx) / fx + 0.15 * width / fx)
         y_clamped = z * np.clip(y / z, -cy / fy - 0.15 * height / fy, (height - cy) / fy + 0.15 * height / fy)
         jacobian = np.array([[fx / z, 0, -fx * x_clamped / z**2], [0, fy / z, -fy * y_clamped / z**2]])
-        conic = np.linalg.inv(jacobian @ covariance @ jacobian.T + 0.3 * np.eye(2))
+        focused = jacobian @ covariance @ jacobian.T + 0.3 * np.eye(2)
+        circle = aperture * abs(1 / focus - 1 / z) * np.array([fx, fy])  # its diameters along x and y
+        blurred = focused + np.diag(circle**2 / 16)
+        conic, fading = np.linalg.inv(blurred), sqrt(np.linalg.det(focused) / np.linalg.det(blurred))
 
         dx, dy = column - (fx * x / z + cx), row - (fy * y / z + cy)
         sigma = 0.5 * (conic[0, 0] * dx**2 + conic[1, 1] * dy**2) + conic[0, 1] * dx * dy
         alpha = np.minimum(0.99, float(opacities[index]) * np.exp(-sigma))
         visible = (alpha >= 1 / 255) & ~closed
+        alpha = alpha * fading
         passed = transmittance * (1 - alpha)
         closed |= visible & (passed <= 1e-4)
         weight = np.where(visible & ~closed, alpha * transmittance, 0)
