@@ -5,7 +5,7 @@
 FROM python:3.13-slim-trixie
 
 COPY . /src
-RUN pip install --no-cache-dir "/src[colmap,fast]" && rm -rf /src/build
+RUN pip install --no-cache-dir "/src[colmap]" && rm -rf /src/build
 
 # For any user: the cache is all that is written outside of /data.
 ENV XDG_CACHE_HOME=/tmp/cache

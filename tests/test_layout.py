@@ -37,12 +37,12 @@ ORDERS = {
 # Modules that import others of ours inside functions: commands, for their start-up time, and these.
 LAZY = {
     "export.pipeline": "PyTorch and onnx are optional",
-    "runtime.rendering.rasterizer": "numba is optional",
+    "runtime.rendering.rasterizer": "numba takes time to load",
     "tools.benchmark.runner": "PyTorch is optional",
     "tools.benchmark.training": "PyTorch is optional",
     "tools.benchmark.worker": "measures what each import costs its process",
-    "tools.evaluation.cases": "numba is optional, and needed for synthetic scenes alone",
-    "tools.evaluation.evaluate": "numba is optional, and needed for synthetic scenes alone",
+    "tools.evaluation.cases": "numba takes time to load, and is needed for synthetic scenes alone",
+    "tools.evaluation.evaluate": "numba takes time to load, and is needed for synthetic scenes alone",
     "tools.evaluation.metrics": "PyTorch is optional, and needed for LPIPS alone",
     "tools.synthetic.make_scene": "a command",
 }

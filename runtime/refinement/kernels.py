@@ -6,16 +6,15 @@ band is an entry. The backward pass writes one row of gradients for each entry, 
 fixed order: no two threads write to one place, and the result does not depend on the number of threads.
 """
 
-import functools
 from math import log
 
-import numba
 import numpy as np
 
 from ..geometry.projection import EPS2D, FOV_MARGIN
 from ..geometry.sh import SH_1, SH_2, SH_3
 from ..rendering.rasterizer_numba import fill_rotation, fill_sh_basis
 from ..rendering.types import MAX_ALPHA, MIN_ALPHA
+from ..system.compilation import compiled
 
 BAND_ROWS = 16
 MIN_TRANSMITTANCE = 1e-4
@@ -27,10 +26,10 @@ PROJECTED = 10
 WEIGHT = 9
 ENTRY = 10
 
-compiled = functools.partial(numba.njit, cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp"})
+compiled_fast = compiled(fastmath={"contract", "arcp"})
 
 
-@compiled()
+@compiled_fast
 def _sh_gradient(x: float, y: float, z: float, worth: np.ndarray, gradient: np.ndarray) -> None:
     """Fill the gradient [3] of sum(worth * basis) with respect to the direction; worth: [coefficients]."""
     count = len(worth)
@@ -59,7 +58,7 @@ def _sh_gradient(x: float, y: float, z: float, worth: np.ndarray, gradient: np.n
     gradient[0], gradient[1], gradient[2] = gx, gy, gz
 
 
-@compiled()
+@compiled_fast
 def project(
     means: np.ndarray,
     quats: np.ndarray,
@@ -135,7 +134,7 @@ def project(
             out[RED + channel] = max(colour, 0.0)
 
 
-@compiled()
+@compiled_fast
 def count_entries(boxes: np.ndarray, offsets: np.ndarray, bands: np.ndarray) -> int:
     """Fill each Gaussian's first entry [gaussians] and each band's number of entries; the number of all entries."""
     total = 0
@@ -148,7 +147,7 @@ def count_entries(boxes: np.ndarray, offsets: np.ndarray, bands: np.ndarray) -> 
     return total
 
 
-@compiled()
+@compiled_fast
 def list_entries(
     order: np.ndarray,
     boxes: np.ndarray,
@@ -168,7 +167,7 @@ def list_entries(
             place[band] += 1
 
 
-@compiled()
+@compiled_fast
 def _row_span(conic_xx: float, conic_xy: float, conic_yy: float, reach: float, dy: float) -> tuple[float, float]:
     """The distances from the centre between which alpha can reach MIN_ALPHA on a row at distance dy from it."""
     inside = conic_xy * conic_xy * dy * dy - conic_xx * (conic_yy * dy * dy - 2 * reach)
@@ -178,7 +177,7 @@ def _row_span(conic_xx: float, conic_xy: float, conic_yy: float, reach: float, d
     return middle - half, middle + half
 
 
-@compiled()
+@compiled_fast
 def composite(
     gaussians: np.ndarray,
     start: int,
@@ -230,7 +229,7 @@ def composite(
             transmittance[row, column] = abs(transmittance[row, column])
 
 
-@compiled()
+@compiled_fast
 def composite_backward(
     gaussians: np.ndarray,
     entries: np.ndarray,
@@ -304,7 +303,7 @@ def composite_backward(
         out[OPACITY], out[RED], out[GREEN], out[BLUE], out[WEIGHT] = for_opacity, for_red, for_green, for_blue, total
 
 
-@compiled()
+@compiled_fast
 def _gaussian_gradient(
     mean: np.ndarray,
     quat: np.ndarray,
@@ -415,7 +414,7 @@ def _gaussian_gradient(
         out[2] += (turn[2] - dz * radial) / distance
 
 
-@compiled()
+@compiled_fast
 def _sum_entries(index: int, boxes: np.ndarray, offsets: np.ndarray, gradients: np.ndarray, total: np.ndarray) -> None:
     total[:] = 0.0
     first, end = offsets[index], offsets[index] + (boxes[index, 3] - 1) // BAND_ROWS - boxes[index, 2] // BAND_ROWS + 1
@@ -424,7 +423,7 @@ def _sum_entries(index: int, boxes: np.ndarray, offsets: np.ndarray, gradients: 
             total[column] += gradients[entry, column]
 
 
-@compiled()
+@compiled_fast
 def parameter_gradients(
     means: np.ndarray,
     quats: np.ndarray,
@@ -458,7 +457,7 @@ def parameter_gradients(
         )  # fmt: skip
 
 
-@compiled()
+@compiled_fast
 def adam_step(
     means: np.ndarray,
     quats: np.ndarray,

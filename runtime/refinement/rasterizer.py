@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ..system.compilation import compiling
 from . import kernels
 
 NEAR = 0.01  # world units
@@ -64,6 +65,17 @@ class Pass:
     gaussians: np.ndarray
     entries: np.ndarray
     target: Target
+
+
+def compile_all() -> None:
+    """Compile what is not yet, by a step on one Gaussian."""
+    arrays = ([[0, 0, 1]], [[1, 0, 0, 0]], [[0, 0, 0]], [0], [[[0, 0, 0]]])
+    parameters = Parameters(*(np.array(array, np.float32) for array in arrays))
+    with compiling(kernels.adam_step, "the refinement"):
+        rasterizer = GradientRasterizer(parameters)
+        done = rasterizer.forward(Target(np.eye(4), np.eye(3), 1, 1))
+        moments, lr = np.zeros((1, 2, parameters.columns), np.float32), np.zeros(parameters.columns)
+        rasterizer.step(done, rasterizer.backward(done, np.zeros_like(done.rgb)), moments, lr, 1)
 
 
 @dataclass(eq=False)

@@ -13,7 +13,7 @@ from ..splats.gaussians import Gaussians
 from ..system.progress import progress
 from .losses import photometric_loss
 from .options import RefinementOptions
-from .rasterizer import BETA_1, BETA_2, EPSILON, GradientRasterizer, Parameters, Target
+from .rasterizer import BETA_1, BETA_2, EPSILON, GradientRasterizer, Parameters, Target, compile_all
 
 MAX_TRANSMITTANCE = 0.5  # of a pixel that counts as covered
 DEFAULT = RefinementOptions()
@@ -75,6 +75,7 @@ def refine(
     the seed alone, not on the number of threads, unless `options.seconds` ends it. Pixels that the scene does not cover
     at the start have no weight, so that no Gaussian is stretched to fill them.
     """
+    compile_all()
     optimiser = _Optimiser(gaussians, views, options)
     order = _view_order(len(views), options.seed)
     psnr: list[float] = []

@@ -1,23 +1,22 @@
-"""A rasteriser of Gaussians for the CPU, in NumPy or compiled by numba, with the semantics of gsplat.
+"""A rasteriser of Gaussians for the CPU, compiled by numba, with the semantics of gsplat.
 
 splats -> rows -> fragments -> pixels: each Gaussian is projected to an ellipse, the ellipse is cut into pixel rows, the
 rows into fragments (one splat at one pixel), and the fragments of a pixel are composited front to back (`types`). The
 image is rendered in bands of rows, in parallel on the machine's cores. A band takes its splats nearest first, as many
 at a time as give a bounded number of fragments: memory does not grow with the overdraw, and occluded splats are
-skipped.
+skipped. `rasterizer_numpy` holds the same steps in NumPy: the reference that the compiled ones are tested against.
 """
 
 import functools
 import os
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from math import ceil, inf
+from types import ModuleType
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
 from ..errors import InputError
-from . import rasterizer_numpy
 from .types import BLOCK_SIZE, GaussianArrays, Rendering, Splats, View
 
 # NumPy sorts 16-bit integers by radix, several times faster than wider ones, so a band has no more pixels than this.
@@ -60,18 +59,19 @@ def rasterize(
     view = _checked_view(viewmat, K, width, height, near, *_checked_lens(aperture, focus))
     backdrop = _checked("background", background, (3,))
 
-    project, composite_band = _kernels()
     band_rows = min(ceil(height / MIN_BANDS), MAX_BAND_PIXELS // width)
     sums = np.empty((height, width, 5), np.float32)  # red, green, blue, depth, alpha
 
-    with ThreadPoolExecutor(min(MAX_THREADS, os.cpu_count() or 1)) as pool:
+    threads = min(MAX_THREADS, os.cpu_count() or 1)
+    kernels = _kernels()
+    with ThreadPoolExecutor(threads) as pool:
         starts = range(0, max(len(gaussians.means), 1), BLOCK_SIZE)
-        blocks = pool.map(lambda start: project(gaussians, start, view), starts)
+        blocks = pool.map(lambda start: kernels.project(gaussians, start, view), starts)
         splats = Splats(*map(np.concatenate, zip(*blocks, strict=True)))
         splats = splats.select(_argsort_depth(splats.features[:, 3]))
 
         def render_band(top: int) -> None:
-            sums[top : top + band_rows] = composite_band(splats, top, min(band_rows, height - top), width)
+            sums[top : top + band_rows] = kernels.composite_band(splats, top, min(band_rows, height - top), width)
 
         list(pool.map(render_band, range(0, height, band_rows)))
 
@@ -80,13 +80,12 @@ def rasterize(
 
 
 @functools.cache
-def _kernels() -> tuple[Callable[..., Splats], Callable[..., np.ndarray]]:
-    """The two expensive steps, projection of a block and compositing of a band; compiled with numba (extra `fast`)."""
-    try:
-        from . import rasterizer_numba as compiled
-    except (ImportError, RuntimeError):
-        return rasterizer_numpy.project, rasterizer_numpy.composite_band
-    return compiled.project, compiled.composite_band
+def _kernels() -> ModuleType:
+    """The two expensive steps, projection of a block and compositing of a band; compiled when this returns."""
+    from . import rasterizer_numba
+
+    rasterizer_numba.compile_all()
+    return rasterizer_numba
 
 
 def _argsort_depth(depth: np.ndarray) -> np.ndarray:

@@ -1,19 +1,16 @@
 """The rasteriser's two expensive steps compiled by numba, one splat after another.
 
 They repeat the arithmetic of `rasterizer_numpy`, `geometry.projection` and `geometry.sh`, in the same order of
-operations, and take the constants from there. Importing this raises ImportError where numba (extra `fast`) is not
-installed, and RuntimeError where there is no folder for compiled code: compiling in every process would take longer
-than NumPy does.
+operations, and take the constants from there.
 """
 
-import functools
 from math import exp, log
 
-import numba
 import numpy as np
 
 from ..geometry.projection import DISC_STD, EPS2D, FOV_MARGIN
 from ..geometry.sh import SH_0, SH_1, SH_2, SH_3
+from ..system.compilation import compiled, compiling
 from .types import BLOCK_SIZE, MAX_ALPHA, MIN_ALPHA, MIN_LOG_TRANSMITTANCE, GaussianArrays, Splats, View
 
 # Alpha is float32, as in NumPy's version: at a limit both must decide alike.
@@ -22,7 +19,15 @@ LOG_MIN_ALPHA = log(MIN_ALPHA)
 MIN_TRANSMITTANCE = exp(MIN_LOG_TRANSMITTANCE)
 ENDED = 0.0  # stands for the transmittance of a pixel that takes no further fragments
 
-_compiled = functools.partial(numba.njit, cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+_compiled = compiled(fastmath={"contract"})
+
+
+def compile_all() -> None:
+    """Compile what is not yet, by rendering one Gaussian."""
+    arrays = (np.array([[0, 0, 1]]), np.ones((1, 4)), np.ones((1, 3)), np.ones(1), np.zeros((1, 1, 3)))
+    gaussian = GaussianArrays(*(array.astype(np.float32) for array in arrays))
+    with compiling(fill_rotation, "the rasteriser"):
+        composite_band(project(gaussian, 0, View(np.eye(4), np.eye(3), 1, 1, 0.01, 0.0, 1.0)), 0, 1, 1)
 
 
 def project(gaussians: GaussianArrays, start: int, view: View) -> Splats:
@@ -44,7 +49,7 @@ def composite_band(splats: Splats, top: int, rows: int, width: int) -> np.ndarra
     return sums
 
 
-@_compiled()
+@_compiled
 def _project(
     means: np.ndarray,
     quats: np.ndarray,
@@ -114,14 +119,14 @@ def _project(
         features[index, 3] = z
 
 
-@_compiled()
+@_compiled
 def _shear_rows(xx: float, xy: float, yy: float) -> tuple[float, float]:
     """shear and row_variance of a covariance, as in `Splats`."""
     shear = xy / yy
     return shear, max(xx - shear * shear * yy, EPS2D)
 
 
-@_compiled()
+@_compiled
 def fill_rotation(quat: np.ndarray, rotation: np.ndarray) -> float:
     """Fill the rotation matrix [3, 3] of a wxyz quaternion of any length, and return that; zero means no rotation."""
     w, x, y, z = np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
@@ -133,7 +138,7 @@ def fill_rotation(quat: np.ndarray, rotation: np.ndarray) -> float:
     return norm
 
 
-@_compiled()
+@_compiled
 def _span(centre: float, half: float, size: int) -> tuple[int, int]:
     """The first pixel whose centre lies within centre +- half, and their number, along a side of `size` pixels."""
     first = min(max(np.ceil(centre - half - 0.5), 0.0), float(size))
@@ -141,7 +146,7 @@ def _span(centre: float, half: float, size: int) -> tuple[int, int]:
     return int(first), max(int(last - first + 1), 0)
 
 
-@_compiled()
+@_compiled
 def _fill_basis(mean: np.ndarray, position: np.ndarray, basis: np.ndarray) -> None:
     """Fill the SH basis functions [coefficients] in the direction from `position` to `mean`."""
     basis[0] = SH_0
@@ -152,7 +157,7 @@ def _fill_basis(mean: np.ndarray, position: np.ndarray, basis: np.ndarray) -> No
     fill_sh_basis(x / norm, y / norm, z / norm, basis)
 
 
-@_compiled()
+@_compiled
 def fill_sh_basis(x: float, y: float, z: float, basis: np.ndarray) -> None:
     """Fill the SH basis functions [coefficients] at a unit direction."""
     basis[0] = SH_0
@@ -174,7 +179,7 @@ def fill_sh_basis(x: float, y: float, z: float, basis: np.ndarray) -> None:
     basis[14], basis[15] = SH_3[4] * z * (xx - yy), -SH_3[0] * x * (xx - 3 * yy)
 
 
-@_compiled()
+@_compiled
 def _composite_band(
     x: np.ndarray,
     y: np.ndarray,

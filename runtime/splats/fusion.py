@@ -8,11 +8,11 @@ surface that is seen through it is supported itself, so that a wrong depth map d
 import os
 from concurrent.futures import ThreadPoolExecutor
 
-import numba
 import numpy as np
 
 from ..geometry.intrinsics import denormalize_intrinsics
 from ..geometry.rigid import invert_rigid
+from ..system.compilation import compiled
 
 DEPTH_TOLERANCE = 0.02  # relative difference in depth up to which two views agree
 ROUNDS = 3  # a point that is removed no longer contradicts others
@@ -58,10 +58,7 @@ def find_contradicted(
     return ~kept
 
 
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
-
-
-@_compiled
+@compiled()
 def _project(point: np.ndarray, viewmat: np.ndarray, K: np.ndarray, height: int, width: int) -> tuple[float, int, int]:
     """The z-depth of a point, and the row and column of its pixel; the row is -1 outside the image."""
     x, y, z = point[0], point[1], point[2]
@@ -76,7 +73,7 @@ def _project(point: np.ndarray, viewmat: np.ndarray, K: np.ndarray, height: int,
     return depth, int(row), int(column)
 
 
-@_compiled
+@compiled()
 def _support(
     points: np.ndarray,  # [height, width, 3]
     neighbors: np.ndarray,
@@ -97,7 +94,7 @@ def _support(
             support[row, column] = count
 
 
-@_compiled
+@compiled()
 def _against(
     points: np.ndarray,
     neighbors: np.ndarray,

@@ -6,7 +6,6 @@ python -P -m idesplat.tools.benchmark.components
 import sys
 import time
 from contextlib import ExitStack
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,6 +17,8 @@ from rich.table import Table
 from ...runtime.cli.terminal import run
 from ...runtime.geometry.intrinsics import intrinsic_matrix
 from ...runtime.inference.session import usable_cores
+from ...runtime.rendering import rasterizer as rasterizer_module
+from ...runtime.rendering import rasterizer_numpy
 from ...runtime.rendering.rasterizer import rasterize
 from ...runtime.splats.formats.ply import read_ply, write_ply
 from ...runtime.splats.gaussians import Gaussians
@@ -36,9 +37,7 @@ Candidates = dict[str, tuple[Any, ...]]
 
 def main(repeats: Annotated[int, typer.Option(help="Rounds.", min=1)] = 9) -> None:
     """Time the rasteriser and .ply files."""
-    rasterizers: Candidates = {"NumPy": (rasterizer, False)}
-    if find_spec("numba"):
-        rasterizers["compiled (numba)"] = (rasterizer, True)
+    rasterizers: Candidates = {"NumPy": (rasterizer, False), "compiled (numba)": (rasterizer, True)}
     with thread_environment(usable_cores()), scratch_folder() as folder:
         run_interleaved(f"{RENDERED_SPLATS:,} splats a pixel wide at {SIDE}x{SIDE}", rasterizers, repeats)
         run_interleaved(f"writing {FILE_SPLATS:,} splats, SH degree 2", _files(folder, "write"), repeats)
@@ -77,8 +76,7 @@ def run_interleaved(title: str, candidates: Candidates, repeats: int) -> None:
 def rasterizer(compiled: bool) -> Prepared:
     """Our rasteriser, compiled or not; the first run includes compiling and loading."""
     if not compiled:
-        sys.modules["numba"] = None  # type: ignore[assignment]  # hide it
-
+        rasterizer_module._kernels = lambda: rasterizer_numpy  # type: ignore[assignment]
     splats, K = pixel_sized_splats(RENDERED_SPLATS), pinhole()
 
     def run() -> None:

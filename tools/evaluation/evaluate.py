@@ -8,7 +8,6 @@ synthetic scenes and `evaluate_captures` real captures. They print nothing; prog
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -168,12 +167,8 @@ def evaluate_synthetic(
     """Evaluate on the first `scenes` held-out synthetic scenes: depth against the truth, and novel views.
 
     views: context views of each scene. pool_views: render this many context views and give `views` of them, evenly
-    spaced, so that numbers of views can be compared on the same scenes. Raises InputError if numba is not installed.
+    spaced, so that numbers of views can be compared on the same scenes.
     """
-    if find_spec("numba") is None:
-        raise InputError(
-            "numba is needed to render synthetic scenes, and is not installed; pip install 'idesplat[eval]'"
-        )
     from ..synthetic.sampler import HELD_OUT_SEEDS
 
     predictor = _opened(model)

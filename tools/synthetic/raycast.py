@@ -9,9 +9,9 @@ Intersection and shading are in one module, since numba's cache does not notice 
 
 import functools
 
-import numba
 import numpy as np
 
+from ...runtime.system.compilation import compiled
 from .scene import Scene
 from .textures import LEVELS, SIZE
 
@@ -24,9 +24,7 @@ CORNER_RANGE, CORNER_STRENGTH = 0.35, 0.35
 
 # fastmath without `nnan` and `ninf`, since rays parallel to a face divide by zero. The loops allocate nothing: without
 # numba's reference counting (`_nrt`) of the scene's arrays at every pixel they are 1.4 times as fast.
-_compiled = functools.partial(
-    numba.njit, cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"}, _nrt=False
-)
+_compiled = functools.partial(compiled, fastmath={"contract", "arcp", "nsz"}, _nrt=False)
 _inlined = functools.partial(_compiled, forceinline=True)
 
 

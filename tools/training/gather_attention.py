@@ -1,19 +1,16 @@
 """Gather attention of epipolar layers for training on a CPU, compiled with numba; it stores no gathered features."""
 
-import functools
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
 
 from ...model.common.gather_attention import GatherAttention
 from ...model.idesplat.network import IDESplat
+from ...runtime.system.compilation import compiled
 
-_compiled = functools.partial(
-    numba.njit, cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp", "nsz", "reassoc"}
-)
+_compiled = compiled(fastmath={"contract", "arcp", "nsz", "reassoc"})
 
 
 def use_compiled_gather_attention(model: IDESplat) -> IDESplat:
@@ -72,7 +69,7 @@ def gathered_weighted_sum(probability: Tensor, table: Tensor, rows: Tensor) -> T
     return _GatheredWeightedSum.apply(probability, table, rows)
 
 
-@_compiled()
+@_compiled
 def _dot(pixels: np.ndarray, table: np.ndarray, rows: np.ndarray, out: np.ndarray) -> None:
     """out[p, c, i] = pixels[p, i] . table[rows[p, c, i]]."""
     pairs, candidates, count = rows.shape
@@ -86,7 +83,7 @@ def _dot(pixels: np.ndarray, table: np.ndarray, rows: np.ndarray, out: np.ndarra
                 out[p, c, i] = total
 
 
-@_compiled()
+@_compiled
 def _weighted_sum(weights: np.ndarray, table: np.ndarray, rows: np.ndarray, out: np.ndarray) -> None:
     """out[p, i] += weights[p, c, i] * table[rows[p, c, i]], summed over c."""
     pairs, candidates, count = rows.shape
@@ -98,7 +95,7 @@ def _weighted_sum(weights: np.ndarray, table: np.ndarray, rows: np.ndarray, out:
                     out[p, i, k] += weight * table[row, k]
 
 
-@_compiled()
+@_compiled
 def _scatter_add(weights: np.ndarray, pixels: np.ndarray, rows: np.ndarray, out: np.ndarray) -> None:
     """out[rows[p, c, i]] += weights[p, c, i] * pixels[p, i]."""
     pairs, candidates, count = rows.shape

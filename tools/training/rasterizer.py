@@ -6,10 +6,8 @@ its bounding box. The backward pass visits them back to front. Nothing is stored
 behind a splat, that before it is T / (1 - alpha).
 """
 
-import functools
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
@@ -18,13 +16,12 @@ from ...model.common.quaternions import quaternions_to_matrices
 from ...model.common.sh import SH_0, sh_basis
 from ...runtime.geometry.projection import EPS2D, FOV_MARGIN
 from ...runtime.rendering.types import MAX_ALPHA, MIN_ALPHA
+from ...runtime.system.compilation import compiled
 
 NEAR = 0.01  # scene units
 MIN_TRANSMITTANCE = 1e-4
 
-_compiled = functools.partial(
-    numba.njit, cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"}
-)
+_compiled = compiled(fastmath={"contract", "arcp", "nsz"})
 
 
 def rasterize(
@@ -132,7 +129,7 @@ class _Composite(torch.autograd.Function):
         return *(torch.from_numpy(part) for part in (for_xy, for_q, for_o, for_v)), None, None
 
 
-@_compiled()
+@_compiled
 def _box(
     centres: np.ndarray, conics: np.ndarray, opacity: float, splat: int, width: int, height: int
 ) -> tuple[int, int, int, int]:
@@ -153,7 +150,7 @@ def _box(
     )
 
 
-@_compiled()
+@_compiled
 def _composite(
     centres: np.ndarray,
     conics: np.ndarray,
@@ -198,7 +195,7 @@ def _composite(
             transmittance[row, column] = abs(transmittance[row, column])
 
 
-@_compiled()
+@_compiled
 def _composite_backward(
     centres: np.ndarray,
     conics: np.ndarray,

@@ -279,9 +279,3 @@ def test_invalid_input_is_one_line_and_leaves_files_untouched(name: str, workpla
     assert len(lines) == 1
     assert expected in lines[0]
     assert {path: path.stat().st_mtime_ns for path in workplace.rglob("*")} == before
-
-
-def test_synthetic_scenes_need_numba(workplace: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
-    monkeypatch.setattr(library, "find_spec", lambda package: None)
-    assert run_command(main, *SYNTHETIC) == 2
-    assert "numba is needed" in capsys.readouterr().err
