@@ -10,7 +10,6 @@ import typer
 from ..cameras.formats import ESTIMATE
 from ..errors import InputError
 from ..inference.depth_format import DepthFormat
-from ..reconstruction.quality import Quality
 from ..system.output_names import SPLATS
 from .interrupting import StopOnInterrupt
 from .options import (
@@ -24,7 +23,9 @@ from .options import (
     Model,
     Near,
     Overwrite,
+    QualityOption,
     Quiet,
+    Refine,
     Size,
     Verbose,
 )
@@ -73,13 +74,7 @@ def infer(
     model: Model = None,
     camera_format: CamerasFormat = None,
     focal: Focal = None,
-    quality: Annotated[
-        Quality | None,
-        typer.Option(
-            help="fast: two images, as the network predicts them. standard: eight, fused and refined. high: 24, "
-            "larger, with more steps. Else standard, and fast with --model."
-        ),
-    ] = None,
+    quality: QualityOption = None,
     views: Annotated[
         str | None,
         typer.Option(
@@ -94,14 +89,7 @@ def infer(
     crop: Annotated[
         bool, typer.Option("--crop", help="Use the middle of the images at the model's trained size.")
     ] = False,
-    refine: Annotated[
-        str | None,
-        typer.Option(
-            help="Steps of refinement on the images, one image each, or its time such as 30s; 0 for none. Else as "
-            "--quality says.",
-            metavar="N|SECONDSs",
-        ),
-    ] = None,
+    refine: Refine = None,
     max_gaussians: MaxGaussians = 0,
     near: Near = None,
     far: Far = None,

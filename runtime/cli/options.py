@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from ..cameras.formats import CameraFormat
+from ..reconstruction.quality import Quality
 from .config_file import read_config
 
 
@@ -85,4 +86,21 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show neither progres
 
 MaxGaussians = Annotated[
     int, typer.Option(help="Keep at most so many Gaussians, those that contribute most to the images; 0: all.", min=0)
+]
+QualityOption = Annotated[
+    Quality | None,
+    typer.Option(
+        "--quality",
+        help="fast: two images, as the network predicts them. standard: eight, fused and refined. high: 24, larger, "
+        "with more steps. Else standard, and fast with --model.",
+        show_default=False,
+    ),
+]
+Refine = Annotated[
+    str | None,
+    typer.Option(
+        help="Steps of refinement on the images, one image each, or its time such as 30s; 0 for none. Else as "
+        "--quality says.",
+        metavar="N|SECONDSs",
+    ),
 ]

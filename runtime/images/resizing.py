@@ -7,7 +7,7 @@ import numpy as np
 
 from ..geometry.intrinsics import crop_intrinsics, normalize_intrinsics, scale_intrinsics
 
-MAX_STRETCH = 1.1
+MAX_STRETCH = 1.15
 
 
 @dataclass(frozen=True)

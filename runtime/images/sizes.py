@@ -37,8 +37,9 @@ def whole_frame_size(aspect: float, area: int, multiple: int) -> tuple[int, int]
     candidates = []
     for rows in range(2, round((area * aspect) ** 0.5 / multiple) + SEARCHED):
         height = rows * multiple
-        width = multiple * max(2, ceil(area / height / multiple))
-        candidates.append((abs(log(height / width / aspect)), height * width, height, width))
+        least = max(2, ceil(area / height / multiple))
+        for width in (multiple * least, multiple * (least + 1)):
+            candidates.append((abs(log(height / width / aspect)), height * width, height, width))
     fitting = [found for found in candidates if found[1] <= MAX_EXTRA_AREA * area] or candidates
     return min(fitting)[2:]
 

@@ -1,8 +1,8 @@
 """Fusion of the views' Gaussians: those that other views contradict are removed, before they hide what is right.
 
 A point is supported by a view whose depth agrees with it, and contradicted by a view that sees a surface behind it:
-that view looks through the point. What only one view sees is neither. Votes against a point weigh as much as the
-surface that is seen through it is supported itself, so that a wrong depth map does not remove a right one.
+that view looks through the point. What only one view sees is neither. Only a surface that is supported itself speaks
+against a point, so that a wrong depth map does not remove a right one.
 """
 
 import os
@@ -18,7 +18,7 @@ DEPTH_TOLERANCE = 0.02  # relative difference in depth up to which two views agr
 ROUNDS = 3  # a point that is removed no longer contradicts others
 # A point is contradicted if the votes against it exceed VOTE_RATIO (MIN_SUPPORT + support).
 MIN_SUPPORT = 0.5
-VOTE_RATIO = 0.5
+VOTE_RATIO = 0.7
 MIN_VOTING_VIEWS = 3  # with two views, a contradiction does not tell which of both is wrong
 
 
@@ -105,13 +105,15 @@ def _against(
     kept: np.ndarray,  # [views, height, width]
     against: np.ndarray,  # [height, width]
 ) -> None:
-    """Sum the support of the surfaces that neighbours see behind each point of a view."""
+    """Count the neighbours that see a supported surface behind each point of a view."""
     height, width = against.shape
     for row in range(height):
         for column in range(width):
-            votes = np.float32(0)
+            votes = 0
             for view in neighbors:
                 z, y, x = _project(points[row, column], viewmats[view], Ks[view], height, width)
-                if y >= 0 and kept[view, y, x] and z < depth[view, y, x] * (1 - DEPTH_TOLERANCE):
-                    votes += support[view, y, x]
+                if y < 0 or not kept[view, y, x] or support[view, y, x] == 0:
+                    continue
+                if z < depth[view, y, x] * (1 - DEPTH_TOLERANCE):
+                    votes += 1
             against[row, column] = votes

@@ -8,6 +8,9 @@ import numpy as np
 from ..cameras.camera import Camera
 from .selection import score_pairs
 
+NO_OVERLAP = 1e6  # more than the cost of any pair that sees something in common
+TINY = np.finfo(np.float64).tiny
+
 
 @dataclass(frozen=True)
 class ViewGroup:
@@ -21,32 +24,39 @@ def group_views(cameras: Sequence[Camera], depths: np.ndarray, size: int) -> lis
     """Groups of at most `size` views so that each view is used once, beside the views that suit it best.
 
     A group grows from a view that has none yet: by the views without a group that make the best pairs with its own,
-    and then by the best partner that each of these lacks. depths: of the scene in each camera, [cameras].
+    and then by the best partner that each of these lacks. Where there is no room for that, the view waits for the next
+    group. size: 3 or more. depths: of the scene in each camera, [cameras].
     """
     count = len(cameras)
     if count <= size:
         return [ViewGroup(tuple(range(count)), tuple(range(count)))]
-    cost = score_pairs(cameras, depths).cost
-    np.fill_diagonal(cost, np.inf)
+    cost = _pair_costs(cameras, depths)
     partners = cost.argmin(axis=1)
     left, groups = set(range(count)), []
     while left:
-        used = _grow(cost, left, max(2, size - size // 3))
+        members = _grow(cost, left, max(2, size - size // 3))
+        lacking = dict.fromkeys(int(partners[view]) for view in members if partners[view] not in members)
+        views = [*members, *lacking][:size]
+        used = [view for view in members if partners[view] in views]  # the first one at least: `size` is above 2
         left -= set(used)
-        lacking = [int(partners[view]) for view in used if partners[view] not in used]
-        views = [*used, *dict.fromkeys(lacking)][:size]
-        if len(views) == 1:
-            views.append(int(partners[views[0]]))
         groups.append(ViewGroup(tuple(sorted(views)), tuple(sorted(used))))
     return groups
 
 
 def nearest_views(cameras: Sequence[Camera], depths: np.ndarray, count: int) -> list[np.ndarray]:
     """The views that make the best pairs with each view, at most `count`, [cameras] arrays of indices."""
+    order = np.argsort(_pair_costs(cameras, depths), axis=1, kind="stable")
+    return list(order[:, : min(count, len(cameras) - 1)])
+
+
+def _pair_costs(cameras: Sequence[Camera], depths: np.ndarray) -> np.ndarray:
+    """The cost of every pair, [cameras, cameras], finite but for the diagonal: without overlap the distance decides."""
     cost = score_pairs(cameras, depths).cost
+    positions = np.stack([camera.extrinsics[:3, 3] for camera in cameras])
+    distance = np.linalg.norm(positions[:, None] - positions, axis=-1)
+    cost = np.where(np.isfinite(cost), cost, NO_OVERLAP * (1 + distance / max(distance.max(), TINY)))
     np.fill_diagonal(cost, np.inf)
-    order = np.argsort(cost, axis=1, kind="stable")[:, : min(count, len(cameras) - 1)]
-    return [row[np.isfinite(cost[view, row])] for view, row in enumerate(order)]
+    return cost
 
 
 def _grow(cost: np.ndarray, left: set[int], size: int) -> list[int]:

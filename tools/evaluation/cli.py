@@ -7,7 +7,19 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ...runtime.cli.input_files import camera_files, model_files
-from ...runtime.cli.options import CAMERAS_HELP, Config, Far, Model, Near, Overwrite, Quiet, Size, Verbose
+from ...runtime.cli.options import (
+    CAMERAS_HELP,
+    Config,
+    Far,
+    Model,
+    Near,
+    Overwrite,
+    QualityOption,
+    Quiet,
+    Refine,
+    Size,
+    Verbose,
+)
 from ...runtime.cli.outputs import command
 from ...runtime.cli.terminal import run, say, warn
 from ...runtime.errors import InputError
@@ -167,6 +179,8 @@ def captures(
     views: Annotated[str, typer.Option(help="Numbers of context views, with commas; 2 are the triples.")] = ",".join(
         map(str, VIEW_COUNTS)
     ),
+    quality: QualityOption = None,
+    refine: Refine = None,
     model: Model = None,
     size: Size = None,
     overwrite: Overwrite = False,
@@ -187,6 +201,8 @@ def captures(
         model,
         captures=capture or [],
         view_counts=counts,
+        quality=quality,
+        refine=refine,
         size=parse_size(size) if size else None,
         on_target=lambda name, strip: save_png(out / f"{name}{IMAGE}", strip),
     )

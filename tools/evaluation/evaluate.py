@@ -19,6 +19,9 @@ from ...runtime.images.finding import find_images
 from ...runtime.inference.bundled_model import bundled_model
 from ...runtime.inference.metadata import ModelMetadata
 from ...runtime.inference.predictor import Predictor
+from ...runtime.reconstruction.quality import Quality
+from ...runtime.reconstruction.steps import make_plan
+from ...runtime.splats.filtering import FilterOptions
 from ...runtime.system.files import scratch_folder
 from ...runtime.system.progress import progress
 from ...runtime.views.batch import match_images_to_cameras
@@ -190,13 +193,16 @@ def evaluate_captures(
     captures: Sequence[str] = (),
     view_counts: Sequence[int] = VIEW_COUNTS,
     size: tuple[int, int] | None = None,
+    quality: Quality | str | None = None,
+    refine: str | None = None,
     on_target: Show | None = None,
 ) -> CaptureEvaluation:
     """Evaluate on real captures at pinned commits of public repositories.
 
     checkouts: a folder of checkouts, each OWNER+NAME or OWNER/NAME; missing ones are cloned into it, or into the user's
     cache if no folder is given. captures: names of some of them instead of all. view_counts: numbers of context views;
-    2 are the triples. on_target: receives a name and a strip for each held-out frame.
+    2 are the triples. quality, refine: as for `reconstruct`. on_target: receives a name and a strip for each held-out
+    frame.
     Raises InputError for unknown captures, and where git or the network fails.
     """
     chosen = read_captures(captures)
@@ -206,7 +212,8 @@ def evaluate_captures(
         predictor.model.check_size(count, *shape)
     folder = checkouts or clones_folder()
     lpips, warnings = _load_metrics()
-    evaluator, found = CaptureEvaluator(predictor, lpips), []
+    plan = make_plan(quality, predictor.model, refine, FilterOptions(), 0)
+    evaluator, found = CaptureEvaluator(predictor, lpips, plan), []
     for capture in progress(chosen, "evaluating"):
         with scratch_folder() as images:
             checkout = fetch_checkout(folder, capture.repository, capture.commit)

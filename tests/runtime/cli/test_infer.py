@@ -107,7 +107,7 @@ def test_what_is_not_used_is_said(workplace, capsys, monkeypatch):
     assert run_command(main, *USUAL, "--size", "128x64", "--select", "0,1") == 0
     # of 128 x 96 pixels, at a trained size of 96 x 64
     printed = capsys.readouterr()
-    assert "the middle 128x64 of each image is used, 37 % of it; --size " in printed.out
+    assert "of each image the middle 128x64 is used, 37 % of it; leave out --size" in printed.out
     for doing in ("reading cameras", "choosing and reading images", "finding near and far", "predicting"):
         assert doing in printed.err
 

@@ -13,7 +13,8 @@ from idesplat.runtime.cameras.undistortion import undistort, undistortion_valid_
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.images.finding import describe_unsupported, find_images, unsupported_images
 from idesplat.runtime.images.io import load_image
-from idesplat.runtime.images.resizing import cover_crop, resize_and_crop
+from idesplat.runtime.images.resizing import cover_crop, frame_crop, resize_and_crop
+from idesplat.runtime.images.sizes import whole_frame_size
 
 # rows of the upright image, in RGB: red, green / blue, white / grey, black
 UPRIGHT = np.array(
@@ -209,7 +210,8 @@ def project(K, points=POINTS):
         (481, 643, 256, 256),  # portrait with odd sides
         (480, 640, 448, 256),  # portrait into landscape
         (643, 481, 320, 448),  # landscape into portrait
-        (200, 150, 448, 320),  # larger
+        (200, 150, 448, 320),  # larger, nearly the same shape: stretched
+        (640, 480, 448, 256),  # another shape: cropped
         (256, 256, 256, 256),  # as it is
     ],
 )
@@ -221,7 +223,7 @@ def test_fit_keeps_every_projection(width, height, target_width, target_height):
     fitted, intrinsics = resize_and_crop(image, K, target_height, target_width)
     assert fitted.shape == (3, target_height, target_width) and fitted.dtype == np.float32
     assert fitted.min() >= 0 and fitted.max() <= 1 and intrinsics.dtype == np.float32
-    crop = cover_crop(width, height, target_width, target_height)
+    crop = frame_crop(width, height, target_width, target_height)
     radius = 4.5 * sigma * crop.scale_x
     centres = project(np.diag([target_width, target_height, 1]) @ intrinsics.astype(np.float64))
     inside = [
@@ -232,6 +234,21 @@ def test_fit_keeps_every_projection(width, height, target_width, target_height):
     for centre, original in zip(centres[inside], project(K)[inside], strict=True):
         np.testing.assert_allclose(centroid(fitted[0], centre, radius), centre, atol=0.01)
         np.testing.assert_allclose((crop.matrix @ [*original, 1])[:2], centre, atol=1e-3)
+
+
+def test_images_of_nearly_the_target_shape_are_whole_and_others_are_cropped():
+    whole = frame_crop(400, 300, 288, 224)
+    assert (whole.width, whole.height, whole.left, whole.top) == (288, 224, 0, 0)
+    assert frame_crop(400, 300, 256, 256) == cover_crop(400, 300, 256, 256)
+
+
+@given(st.floats(0.3, 3.0), st.integers(40_000, 600_000), st.sampled_from([14, 16, 32]))
+def test_the_size_of_a_whole_frame_has_its_shape_and_no_fewer_pixels(aspect, area, multiple):
+    height, width = whole_frame_size(aspect, area, multiple)
+    assert height % multiple == width % multiple == 0
+    assert area <= height * width <= 1.3 * area
+    crop = frame_crop(1200, round(1200 * aspect), width, height)
+    assert crop.left == crop.top == 0 and (crop.width, crop.height) == (width, height)
 
 
 @pytest.mark.parametrize("distortion", [(0.1, -0.05, 0.002, -0.003), (-0.15, 0.03, 0.0, 0.004)])

@@ -7,10 +7,18 @@ from pathlib import Path
 
 import numpy as np
 
+from ....runtime.cameras.camera import Camera
+from ....runtime.cameras.undistortion import UndistortedImage
+from ....runtime.images.colormaps import to_uint8
 from ....runtime.inference.predictor import Predictor
+from ....runtime.reconstruction.many_views import predict_views
+from ....runtime.reconstruction.steps import Plan, fuse, refine_prediction
 from ....runtime.splats.gaussians import Gaussians
+from ....runtime.system.progress import reporting_to
+from ....runtime.views.batch import ViewBatch
+from ....runtime.views.depth_range import DepthRange
 from ..baselines import best_fronto_parallel_plane, nearest_view
-from ..cases import EvalCase
+from ..cases import EvalCase, PosedImages
 from ..metrics import LPIPS, fit_exposure, psnr, ssim
 from ..novel_views import MODEL, NEAREST, ORACLE_PLANE, Scores, comparison_strip, render_target
 from .capture import PAIR, Capture, CaptureImages
@@ -59,10 +67,10 @@ class CaptureScores:
 
 
 class CaptureEvaluator:
-    """Evaluates a model on captures; lpips: None where it cannot be computed."""
+    """Evaluates a model on captures; lpips: None where it cannot be computed. plan: what follows the prediction."""
 
-    def __init__(self, predictor: Predictor, lpips: LPIPS | None) -> None:
-        self.predictor, self.lpips = predictor, lpips
+    def __init__(self, predictor: Predictor, lpips: LPIPS | None, plan: Plan) -> None:
+        self.predictor, self.lpips, self.plan = predictor, lpips, plan
 
     def evaluate(
         self, capture: Capture, images: CaptureImages, counts: Sequence[int], show: Show | None = None
@@ -129,10 +137,14 @@ class CaptureEvaluator:
         return CaseScores(case.context.names, targets, _input_psnr(gaussians, case), seconds)
 
     def _predict(self, case: EvalCase) -> tuple[Gaussians, float]:
-        context, started = case.context, time.perf_counter()
-        prediction = self.predictor.predict_arrays(
-            context.images, context.extrinsics, context.intrinsics, case.near, case.far
-        )
+        """The Gaussians as `reconstruct` makes them of these views, and the seconds that it takes."""
+        views, span = _view_batch(case.context), DepthRange(case.near, case.far, "given")
+        started = time.perf_counter()
+        with reporting_to(None):
+            prediction = predict_views(self.predictor, views, span)
+            prediction = fuse(prediction, views, span, self.plan.filters).prediction
+            if self.plan.copy_side:
+                prediction = refine_prediction(prediction, views, self.plan, None).prediction
         return prediction.need_gaussians(), time.perf_counter() - started
 
     def _measure(self, image: np.ndarray, truth: np.ndarray, valid: np.ndarray) -> dict[str, float]:
@@ -163,6 +175,20 @@ def _input_psnr(gaussians: Gaussians, case: EvalCase) -> float:
         for view in range(len(context))
     ]
     return float(np.mean(values))
+
+
+def _view_batch(context: PosedImages) -> ViewBatch:
+    """Context views as a reconstruction has them; they are refined on at the size that the network gets."""
+    height, width = context.images.shape[2:]
+    cameras = [
+        Camera(name, width, height, context.K(view), context.extrinsics[view])
+        for view, name in enumerate(context.names)
+    ]
+    copies = [
+        UndistortedImage(to_uint8(context.image(view)), camera, context.valid[view])
+        for view, camera in enumerate(cameras)
+    ]
+    return ViewBatch(context.names, context.images, context.extrinsics, context.intrinsics, cameras, copies=copies)
 
 
 def _strip_name(case: EvalCase, target: int) -> str:

@@ -1,0 +1,69 @@
+"""Fusion: what other views see through goes; what only one view sees, and what views agree on, stays."""
+
+import numpy as np
+import pytest
+from idesplat.runtime.geometry.intrinsics import denormalize_intrinsics
+from idesplat.runtime.splats.fusion import find_contradicted
+
+HEIGHT, WIDTH = 24, 32
+WALL = 4.0
+PATCH = (slice(8, 14), slice(10, 18))
+K = np.array([[0.9, 0, 0.5], [0, 1.2, 0.5], [0, 0, 1]], np.float32)
+
+
+def cameras(count: int) -> np.ndarray:
+    """Cameras side by side that look at the wall, camera-to-world [views, 4, 4]."""
+    extrinsics = np.tile(np.eye(4), (count, 1, 1))
+    extrinsics[:, 0, 3] = 0.3 * np.arange(count)
+    return extrinsics
+
+
+def unproject(depth: np.ndarray, extrinsics: np.ndarray) -> np.ndarray:
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    pixels = np.stack([columns, rows, np.ones_like(rows)], axis=-1)
+    rays = pixels @ np.linalg.inv(denormalize_intrinsics(K[None], WIDTH, HEIGHT)[0]).T
+    return rays * depth[..., None] + extrinsics[:, None, None, :3, 3]
+
+
+def contradicted(depth: np.ndarray) -> np.ndarray:
+    extrinsics = cameras(len(depth))
+    return find_contradicted(unproject(depth, extrinsics), depth, extrinsics, np.tile(K, (len(depth), 1, 1)))
+
+
+def wall(views: int) -> np.ndarray:
+    return np.full((views, HEIGHT, WIDTH), WALL)
+
+
+@pytest.mark.parametrize("views", [2, 3, 5])
+def test_a_wall_that_all_views_agree_on_stays(views: int) -> None:
+    assert not contradicted(wall(views)).any()
+
+
+def test_a_patch_that_one_view_puts_before_the_wall_goes_and_nothing_else() -> None:
+    depth = wall(4)
+    depth[1][PATCH] = 2.0
+    found = contradicted(depth)
+    assert found[1][PATCH].mean() > 0.9
+    found[1][PATCH] = False
+    assert not found.any()
+
+
+def test_a_patch_that_most_views_see_stays_and_the_one_that_sees_through_it_loses_nothing_before_it() -> None:
+    """A real object before the wall: the view that misses it has its wall behind, which nothing contradicts."""
+    depth = wall(4)
+    for view in (0, 1, 2):
+        shift = round(0.3 * view * WIDTH * float(K[0, 0]) / 2.0)
+        depth[view][PATCH[0], PATCH[1].start - shift + 4 : PATCH[1].stop - shift + 4] = 2.0
+    found = contradicted(depth)
+    for view in (0, 1, 2):
+        assert found[view][depth[view] == 2.0].mean() < 0.2
+
+
+def test_what_only_one_view_sees_stays() -> None:
+    """A point outside the other images, and one hidden behind the wall of the others, are unseen, not contradicted."""
+    depth = wall(3)
+    depth[0, :, :3] = 1.0
+    depth[2][PATCH] = 9.0
+    found = contradicted(depth)
+    assert not found[0, :, :3].any()
+    assert not found[2][PATCH].any()
