@@ -38,6 +38,7 @@ ORDERS = {
 LAZY = {
     "export.pipeline": "PyTorch and onnx are optional",
     "runtime.rendering.rasterizer": "numba takes time to load",
+    "tools.benchmark.components": "PyTorch is optional",
     "tools.benchmark.runner": "PyTorch is optional",
     "tools.benchmark.training": "PyTorch is optional",
     "tools.benchmark.worker": "measures what each import costs its process",

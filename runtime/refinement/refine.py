@@ -76,7 +76,7 @@ def refine(
     at the start have no weight, so that no Gaussian is stretched to fill them.
     """
     compile_all()
-    optimiser = _Optimiser(gaussians, views, options)
+    optimiser = Optimiser(gaussians, views, options)
     order = _view_order(len(views), options.seed)
     psnr: list[float] = []
     started = time.perf_counter()
@@ -96,7 +96,7 @@ def refine(
     return Refined(_gaussians(optimiser.parameters), psnr, optimiser.gains, optimiser.offsets)
 
 
-class _Optimiser:
+class Optimiser:
     """Gaussians and the views' exposures, with their moments and learning rates."""
 
     def __init__(self, gaussians: Gaussians, views: Sequence[PosedImage], options: RefinementOptions) -> None:

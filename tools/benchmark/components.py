@@ -6,6 +6,7 @@ python -P -m idesplat.tools.benchmark.components
 import sys
 import time
 from contextlib import ExitStack
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,6 +18,8 @@ from rich.table import Table
 from ...runtime.cli.terminal import run
 from ...runtime.geometry.intrinsics import intrinsic_matrix
 from ...runtime.inference.session import usable_cores
+from ...runtime.refinement.options import RefinementOptions
+from ...runtime.refinement.refine import Optimiser, PosedImage
 from ...runtime.rendering import rasterizer as rasterizer_module
 from ...runtime.rendering import rasterizer_numpy
 from ...runtime.rendering.rasterizer import rasterize
@@ -36,10 +39,13 @@ Candidates = dict[str, tuple[Any, ...]]
 
 
 def main(repeats: Annotated[int, typer.Option(help="Rounds.", min=1)] = 9) -> None:
-    """Time the rasteriser and .ply files."""
+    """Time the rasteriser, refinement and .ply files."""
     rasterizers: Candidates = {"NumPy": (rasterizer, False), "compiled (numba)": (rasterizer, True)}
     with thread_environment(usable_cores()), scratch_folder() as folder:
         run_interleaved(f"{RENDERED_SPLATS:,} splats a pixel wide at {SIDE}x{SIDE}", rasterizers, repeats)
+        if find_spec("torch"):
+            steps: Candidates = {"PyTorch": (torch_refinement,), "compiled (numba)": (refinement,)}
+            run_interleaved(f"a step of refinement, {RENDERED_SPLATS:,} splats at {SIDE}x{SIDE}, L1", steps, repeats)
         run_interleaved(f"writing {FILE_SPLATS:,} splats, SH degree 2", _files(folder, "write"), repeats)
         run_interleaved(f"reading {FILE_SPLATS:,} splats, SH degree 2", _files(folder, "read"), repeats)
 
@@ -104,6 +110,43 @@ def pixel_sized_splats(count: int) -> "Gaussians":
 def pinhole() -> np.ndarray:
     """K of the camera of `pixel_sized_splats`, in pixels, [3, 3]."""
     return intrinsic_matrix(FOCAL, FOCAL, SIDE / 2, SIDE / 2)
+
+
+# ---- refinement
+
+
+def refinement() -> Prepared:
+    """A step of `runtime.refinement`."""
+    image = np.full((SIDE, SIDE, 3), 0.5, np.float32)
+    view = PosedImage(image, np.eye(4), pinhole(), np.ones((SIDE, SIDE), bool))
+    optimiser = Optimiser(pixel_sized_splats(RENDERED_SPLATS), [view], RefinementOptions(ssim_weight=0))
+
+    def run() -> None:
+        optimiser.step(0, 1.0)
+
+    return None, run
+
+
+def torch_refinement() -> Prepared:
+    """The same step with the differentiable rasteriser of training and PyTorch's Adam."""
+    import torch
+
+    from ..training.rasterizer import rasterize as torch_rasterize
+
+    splats = pixel_sized_splats(RENDERED_SPLATS)
+    parts = (splats.means, splats.quats, np.log(splats.scales), splats.opacities, splats.sh)
+    means, quats, log_scales, opacities, sh = parameters = [torch.from_numpy(part).requires_grad_() for part in parts]
+    adam = torch.optim.Adam(parameters, lr=1e-4)
+    target, K = torch.full((SIDE, SIDE, 3), 0.5), torch.from_numpy(pinhole()).float()
+    camera = torch.eye(4), K, SIDE, SIDE, torch.zeros(3)
+
+    def run() -> None:
+        adam.zero_grad()
+        rgb, _, _ = torch_rasterize(means, quats, log_scales.exp(), opacities.clamp(1e-3, 0.999), sh, *camera)
+        (rgb - target).abs().mean().backward()
+        adam.step()
+
+    return None, run
 
 
 # ---- files
