@@ -1,0 +1,73 @@
+"""Prediction in groups: every view once, in order, from a group that fits the memory."""
+
+import numpy as np
+import pytest
+from idesplat.runtime.cameras.camera import Camera
+from idesplat.runtime.inference.predictor import Prediction
+from idesplat.runtime.reconstruction import many_views
+from idesplat.runtime.splats.gaussians import Gaussians
+from idesplat.runtime.views.batch import ViewBatch
+from idesplat.runtime.views.depth_range import DepthRange
+
+HEIGHT, WIDTH = 4, 6
+SPAN = DepthRange(5.0, 20.0, "given")
+K = np.array([[6.0, 0, 3], [0, 6.0, 2], [0, 0, 1]])
+
+
+def batch(count: int) -> ViewBatch:
+    """Views along a line, in a mixed order, whose images have their number as their value."""
+    numbers = np.random.default_rng(0).permutation(count)
+    extrinsics = np.tile(np.eye(4), (count, 1, 1))
+    extrinsics[:, 0, 3] = 0.8 * numbers
+    names = [f"{number}.png" for number in numbers]
+    cameras = [Camera(name, WIDTH, HEIGHT, K, pose) for name, pose in zip(names, extrinsics, strict=True)]
+    images = np.ones((count, 3, HEIGHT, WIDTH), np.float32) * numbers[:, None, None, None]
+    intrinsics = np.tile(np.float32([[1, 0, 0.5], [0, 1.5, 0.5], [0, 0, 1]]), (count, 1, 1))
+    return ViewBatch(names, images, extrinsics, intrinsics, cameras)
+
+
+class NumberingPredictor:
+    """Predicts each image's number as its depth, opacity and means; keeps the sizes of the groups."""
+
+    def __init__(self, gaussians: bool) -> None:
+        self.gaussians, self.groups = gaussians, []
+
+    def predict_views(self, views: ViewBatch, near: float, far: float) -> Prediction:
+        assert (near, far) == (SPAN.near, SPAN.far)
+        self.groups.append(views.names)
+        depth = views.images[:, 0]
+        flat = depth.ravel()
+        gaussians = Gaussians(
+            np.repeat(flat[:, None], 3, axis=1),
+            np.ones((flat.size, 3), np.float32),
+            np.ones((flat.size, 4), np.float32),
+            flat,
+            np.zeros((flat.size, 1, 3), np.float32),
+        )
+        return Prediction(depth, gaussians if self.gaussians else None, {"model": 1.0}, views.cameras)
+
+
+@pytest.mark.parametrize("count", [2, 5, 6, 17])
+@pytest.mark.parametrize("gaussians", [True, False])
+def test_every_view_is_predicted_once_and_in_order(
+    count: int, gaussians: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(many_views, "GROUP_PIXELS", 5 * HEIGHT * WIDTH)
+    views, predictor = batch(count), NumberingPredictor(gaussians)
+    prediction = many_views.predict_views(predictor, views, SPAN)
+    np.testing.assert_array_equal(prediction.depth, views.images[:, 0])
+    assert [camera.name for camera in prediction.cameras] == views.names
+    assert all(len(names) <= 5 for names in predictor.groups)
+    assert len(predictor.groups) == (1 if count <= 5 else len(predictor.groups)) and predictor.groups
+    assert prediction.seconds == {"model": float(len(predictor.groups))}
+    if gaussians:
+        np.testing.assert_array_equal(prediction.need_gaussians().opacities, views.images[:, 0].ravel())
+    else:
+        assert prediction.gaussians is None
+
+
+def test_large_images_still_run_in_groups_of_three(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(many_views, "GROUP_PIXELS", 1)
+    predictor = NumberingPredictor(True)
+    many_views.predict_views(predictor, batch(7), SPAN)
+    assert {len(names) for names in predictor.groups} <= {2, 3}
