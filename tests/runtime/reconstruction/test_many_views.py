@@ -58,7 +58,7 @@ def test_every_view_is_predicted_once_and_in_order(
     np.testing.assert_array_equal(prediction.depth, views.images[:, 0])
     assert [camera.name for camera in prediction.cameras] == views.names
     assert all(len(names) <= 5 for names in predictor.groups)
-    assert len(predictor.groups) == (1 if count <= 5 else len(predictor.groups)) and predictor.groups
+    assert (len(predictor.groups) == 1) == (count <= 5)
     assert prediction.seconds == {"model": float(len(predictor.groups))}
     if gaussians:
         np.testing.assert_array_equal(prediction.need_gaussians().opacities, views.images[:, 0].ravel())
