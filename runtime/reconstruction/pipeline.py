@@ -110,6 +110,7 @@ def reconstruct(
         with working("predicting depth and Gaussians"):
             prediction = predict_views(predictor, placed, span)
         LOG.info("predicted in %s", ", ".join(f"{name} {value:.2f} s" for name, value in prediction.seconds.items()))
+        del predictor  # its memory is needed for the refinement
         seconds |= prediction.seconds
         fused = fuse(prediction, placed, span, plan.filters)
         finished = refine_prediction(fused.prediction, placed, plan, on_step)

@@ -1,0 +1,78 @@
+"""Figures of real captures: the prediction alone and the finished scene, at a held-out camera and from the side.
+
+python -P -m idesplat.tools.figures.capture_figures --checkouts DIR --out docs/images can cup
+"""
+
+from pathlib import Path
+from typing import Annotated
+
+import cv2
+import numpy as np
+import typer
+
+from ...runtime.cameras.camera import Camera, resize_camera
+from ...runtime.cli.terminal import run, say
+from ...runtime.images.colormaps import to_uint8
+from ...runtime.reconstruction.pipeline import reconstruct
+from ...runtime.reconstruction.quality import Quality
+from ...runtime.rendering.cameras import orbit_cameras
+from ...runtime.rendering.render import render_view
+from ...runtime.splats.gaussians import Gaussians
+from ...runtime.system.files import atomic_write, make_folder, scratch_folder
+from ..evaluation.captures.capture import Capture, read_captures
+from ..evaluation.captures.checkouts import extract, fetch_checkout
+
+VIEWS = 6
+SIDE = 384  # pixels: longer side of each rendering
+DEGREES = 30  # swing of the orbit; its quarter is half of that to one side
+JPEG_QUALITY = 90
+
+
+def figures(
+    names: Annotated[list[str], typer.Argument(help="Captures.", show_default=False)],
+    checkouts: Annotated[Path, typer.Option(help="Folder of checkouts; missing ones are cloned into it.")],
+    out: Annotated[Path, typer.Option(help="Folder for NAME.jpg.")],
+) -> None:
+    """Write NAME.jpg: prediction and finished scene at a held-out camera, and both from the side."""
+    for capture in read_captures(names):
+        path = make_folder(out) / f"capture-{capture.name}.jpg"
+        with scratch_folder() as folder:
+            checkout = fetch_checkout(checkouts, capture.repository, capture.commit)
+            extract(checkout, capture.commit, capture.folder, capture.frames, folder)
+            row = _row(capture, folder)
+        image = np.ascontiguousarray(to_uint8(np.hstack(row))[..., ::-1])
+        with atomic_write(path) as temporary:
+            temporary.write_bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes())
+        say(f"wrote {path}")
+
+
+def _row(capture: Capture, folder: Path) -> list[np.ndarray]:
+    context, held_out = capture.window(VIEWS)
+    cameras = [capture.cameras[name] for name in context]
+    images = [folder / name for name in context]
+    before, after = (
+        reconstruct(images, cameras, quality=quality, views="all").gaussians
+        for quality in (Quality.FAST, Quality.STANDARD)
+    )
+    assert before is not None and after is not None, "the bundled model predicts Gaussians"
+    target = _small(capture.cameras[held_out[len(held_out) // 2]])
+    side = _small(orbit_cameras(after, cameras, DEGREES, 4)[1])
+    return [_render(gaussians, camera) for camera in (target, side) for gaussians in (before, after)]
+
+
+def _small(camera: Camera) -> Camera:
+    factor = SIDE / max(camera.width, camera.height)
+    return resize_camera(camera, round(camera.width * factor), round(camera.height * factor))
+
+
+def _render(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+    return render_view(gaussians, camera.extrinsics, camera.K, camera.width, camera.height).rgb
+
+
+def main() -> None:
+    """Run the command."""
+    run(figures)
+
+
+if __name__ == "__main__":
+    main()
