@@ -99,7 +99,7 @@ def test_images_are_prepared_as_for_inference(scene: Path) -> None:
     assert case.context.valid.all() and case.targets.valid.all()
     K = views.cameras[2].K
     np.testing.assert_allclose(case.targets.K(0)[0, 0], 0.75 * K[0, 0], rtol=1e-6)
-    np.testing.assert_allclose(case.targets.K(0)[1, 2], 0.75 * K[1, 2] - 4, rtol=1e-6)
+    np.testing.assert_allclose(case.targets.K(0)[1, 2], 64 / 96 * K[1, 2], rtol=1e-6)
 
 
 def test_black_borders_are_invalid(scene: Path, tmp_path: Path) -> None:
@@ -123,15 +123,22 @@ def test_pixels_outside_the_lens_image_are_invalid(scene: Path) -> None:
     assert valid[16:48, 24:72].all() and not valid[0, 0] and 0.5 < valid.mean() < 0.99
 
 
+@pytest.mark.parametrize(
+    ("size", "scales", "top"),
+    [((64, 96), (64 / 96, 0.75), 0), ((64, 128), (1, 1), 16)],
+    ids=["nearly the same shape: stretched", "another shape: cropped"],
+)
 @pytest.mark.parametrize("along", ["rows", "columns"])
-def test_true_depth_is_sampled_at_the_networks_pixels(along: str, scene: Path, tmp_path: Path) -> None:
+def test_true_depth_is_sampled_at_the_networks_pixels(
+    along: str, size: tuple[int, int], scales: tuple[float, float], top: int, scene: Path, tmp_path: Path
+) -> None:
     """Depth that is the pixel coordinate tells where it was sampled: within half a pixel."""
     y, x = np.meshgrid(np.arange(96) + 0.5, np.arange(128) + 0.5, indexing="ij")
     for name in ("000", "004"):
         np.savez(tmp_path / f"{name}.npz", depth=y if along == "rows" else x)
-    case = load_case(frames_of(scene), [0, 4], [2], SIZE, find_range, tmp_path)
-    assert case.depth is not None and case.depth.shape == (2, HEIGHT, WIDTH)
-    rows, columns = (np.arange(HEIGHT) + 0.5 + 4) / 0.75, (np.arange(WIDTH) + 0.5) / 0.75
+    case = load_case(frames_of(scene), [0, 4], [2], size, find_range, tmp_path)
+    assert case.depth is not None and case.depth.shape == (2, *size)
+    rows, columns = (np.arange(size[0]) + 0.5 + top) / scales[0], (np.arange(size[1]) + 0.5) / scales[1]
     expected = rows[:, None] if along == "rows" else columns[None]
     assert np.abs(case.depth - expected).max() <= 0.5 + 1e-6
 
