@@ -71,8 +71,8 @@ class ViewMatcher:
         features, K = self._features
         first = features[i]
         if max_features is not None and len(first.keypoints) > max_features:
-            step = -(-len(first.keypoints) // max_features)
-            first = Features(first.keypoints[::step], first.descriptors[::step])
+            chosen = np.linspace(0, len(first.keypoints) - 1, max_features).astype(int)
+            first = Features(first.keypoints[chosen], first.descriptors[chosen])
         second_from_first = invert_rigid(self.extrinsics[j]) @ self.extrinsics[i]
         matches = match_along_epipolar_lines(first, features[j], K[i], K[j], second_from_first)
         if first is features[i]:
