@@ -11,6 +11,7 @@ from ..cameras.formats import ESTIMATE
 from ..errors import InputError
 from ..inference.depth_format import DepthFormat
 from ..system.output_names import SPLATS
+from ..views.exposure_mode import ExposureMode
 from .interrupting import StopOnInterrupt
 from .options import (
     CamerasFormat,
@@ -100,6 +101,10 @@ def infer(
             metavar="auto|X,Y,Z",
         ),
     ] = None,
+    exposure: Annotated[
+        ExposureMode,
+        typer.Option(help="Bring images of differing exposure and white balance to a common one, or leave them."),
+    ] = ExposureMode.AUTO,
     provider: Annotated[str, typer.Option(help="ONNX Runtime execution provider, such as CPU or CUDA.")] = "CPU",
     save_depth: Annotated[Path | None, typer.Option(help="Folder for depth maps with their cameras.")] = None,
     depth_format: Annotated[
@@ -204,6 +209,7 @@ def infer(
             near=near,
             far=far,
             offset=offset,
+            exposure=exposure,
             provider=provider,
             filters=FilterOptions() if surface else filters,
             on_inputs=targets.announce_views,

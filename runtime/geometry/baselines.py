@@ -18,6 +18,24 @@ def nearest_neighbor_pairs(extrinsics: np.ndarray) -> list[tuple[int, int]]:
     return sorted({(min(i, j), max(i, j)) for i, j in enumerate(distances.argmin(axis=1).tolist())})
 
 
+def connected_neighbor_pairs(extrinsics: np.ndarray, count: int) -> list[tuple[int, int]]:
+    """Each camera paired with its `count` nearest ones, and the pairs that connect all cameras over least distances.
+
+    Sorted pairs (i, j), i < j, without duplicates. The connecting pairs are those of a minimum spanning tree.
+    """
+    distances = pairwise_baselines(extrinsics)
+    np.fill_diagonal(distances, np.inf)
+    nearest = np.argsort(distances, axis=1, kind="stable")[:, : min(count, len(distances) - 1)]
+    pairs = {(min(i, j), max(i, j)) for i, row in enumerate(nearest.tolist()) for j in row}
+    reached = np.arange(len(distances)) == 0
+    while not reached.all():  # Prim's algorithm
+        outward = np.where(reached[:, None] & ~reached, distances, np.inf)
+        i, j = divmod(int(outward.argmin()), len(distances))
+        reached[j] = True
+        pairs.add((min(i, j), max(i, j)))
+    return sorted(pairs)
+
+
 def longest_baseline(positions: np.ndarray) -> float:
     """The largest distance between two of the positions [cameras, 3], in O(cameras) memory."""
     longest = 0.0

@@ -112,7 +112,7 @@ class Predictor:
         """
         trained = self.metadata.near, self.metadata.far
         return estimate_depth_range(
-            views.images, views.extrinsics, views.intrinsics, views.cameras, trained, near, far, views.feature_images
+            views.images, views.extrinsics, views.intrinsics, views.cameras, trained, near, far, views.matcher
         )
 
     def predict_arrays(

@@ -18,6 +18,8 @@ from ..inference.predictor import Predictor
 from ..inference.session import CPU, provider_name
 from ..splats.filtering import FilterOptions
 from ..system.progress import CALLBACK, ProgressCallback, reporting_to, working
+from ..views.exposure import compensate_exposure
+from ..views.exposure_mode import ExposureMode, parse_exposure_mode
 from ..views.world_offset import apply_offset, parse_offset
 from .many_views import predict_views
 from .quality import Quality
@@ -46,6 +48,7 @@ def reconstruct(
     near: float | None = None,
     far: float | None = None,
     offset: str | None = None,
+    exposure: str = ExposureMode.AUTO,
     provider: str = CPU,
     filters: FilterOptions | None = None,
     on_inputs: Callable[[Inputs], None] | None = None,
@@ -69,6 +72,8 @@ def reconstruct(
     the images.
     near, far: bounds of depth in scene units; found from matched points or the baseline where not given.
     offset: "auto" or "X,Y,Z", subtracted from world coordinates that float32 does not hold.
+    exposure: "auto" brings the views to a common exposure and white balance where these differ; "off" leaves the images
+    as they are, for the plain prediction of a model.
     on_inputs: called with the chosen views before the model is loaded; its exceptions propagate. on_step: called with
     each step of the refinement and its view's PSNR; ends the refinement by returning False.
     progress: receives reports of progress, see `Progress` in `idesplat.runtime.system.progress`.
@@ -77,6 +82,7 @@ def reconstruct(
     _check_depth_bounds(near, far)
     provider_name(provider)
     parse_offset(offset or "auto")
+    mode = parse_exposure_mode(exposure)
     with reporting_to(progress or CALLBACK.get()):
         files = model if isinstance(model, ModelFiles) else read_model(model or bundled_model())
         plan = make_plan(quality, files, refine, filters or FilterOptions(), max_gaussians)
@@ -105,7 +111,9 @@ def reconstruct(
         LOG.info("loaded %s on %s in %.2f s", files.path, provider, predictor.load_seconds)
         with working("finding near and far"):
             span = predictor.depth_range(inputs.views, near, far)
-        placed, notes = apply_offset(inputs.views, offset, span.near)
+        with working("comparing exposures"):
+            exposed, found = compensate_exposure(inputs.views, mode)
+        placed, notes = apply_offset(exposed, offset, span.near)
         seconds = {"load": predictor.load_seconds, "prepare": prepared - started + time.perf_counter() - loaded}
         with working("predicting depth and Gaussians"):
             prediction = predict_views(predictor, placed, span)
@@ -122,7 +130,8 @@ def reconstruct(
         plan.filters,
         fused.removed,
         seconds | fused.seconds | finished.seconds,
-        inputs.notes + notes + fused.notes + finished.notes,
+        inputs.notes + found.notes + notes + fused.notes + finished.notes,
+        found,
         finished.psnr,
     )
 

@@ -3,6 +3,7 @@
 import re
 from dataclasses import dataclass
 from enum import StrEnum
+from math import inf
 
 from ..errors import InputError
 
@@ -38,7 +39,7 @@ class Preset:
 
 
 PRESETS = {
-    Quality.FAST: Preset(views=2, pixels=0, fuse=False, steps_per_view=0, seconds=0, copy_side=COPY_SIDE),
+    Quality.FAST: Preset(views=2, pixels=0, fuse=False, steps_per_view=0, seconds=inf, copy_side=COPY_SIDE),
     Quality.STANDARD: Preset(views=8, pixels=0, fuse=True, steps_per_view=15, seconds=40, copy_side=COPY_SIDE),
     Quality.HIGH: Preset(views=24, pixels=1 << 17, fuse=True, steps_per_view=30, seconds=240, copy_side=640),
 }
@@ -46,10 +47,10 @@ PRESETS = {
 
 @dataclass(frozen=True)
 class RefinementLimit:
-    """When a refinement ends: after so many steps, None for as many as suit the views, or seconds."""
+    """When a refinement ends: after so many steps, or seconds."""
 
-    steps: int | None
-    seconds: float = float("inf")
+    steps: int
+    seconds: float = inf
 
 
 def parse_refine(text: str) -> RefinementLimit:
@@ -59,4 +60,4 @@ def parse_refine(text: str) -> RefinementLimit:
         raise InputError(
             f"--refine {text[:40]}: expected a number of steps up to {MAX_STEPS}, 0 for none, or a time such as 30s"
         )
-    return RefinementLimit(None, float(found[1])) if found[2] else RefinementLimit(int(found[1]))
+    return RefinementLimit(MAX_STEPS, float(found[1])) if found[2] else RefinementLimit(int(found[1]))

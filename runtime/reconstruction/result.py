@@ -29,6 +29,7 @@ from ..system.progress import progress
 from ..viewer.report import write_report
 from ..views.batch import ViewBatch
 from ..views.depth_range import DepthRange
+from ..views.exposure import Exposure
 from .files import PATH_FRAMES, render_files, view_stems
 
 
@@ -39,7 +40,8 @@ class Reconstruction:
     prediction: the model's output, with filtered Gaussians. inputs: images, cameras and the chosen views.
     model: the model's files. depth_range: near and far in scene units, and their source.
     filters: the options. removed: number of Gaussians that each filter removed, by name.
-    timings: seconds by step. notes: lines for the user. psnr: of the refinement's views before each of its steps.
+    timings: seconds by step. notes: lines for the user. exposure: how the views were brought to a common exposure.
+    psnr: of the refinement's views before each of its steps.
     """
 
     prediction: Prediction
@@ -50,6 +52,7 @@ class Reconstruction:
     removed: dict[str, int]
     timings: dict[str, float]
     notes: list[str]
+    exposure: Exposure
     psnr: list[float] = field(default_factory=list)
 
     @property
@@ -144,6 +147,7 @@ class Reconstruction:
             "seconds": seconds or self.timings,
             "files": [str(path) for path in files],
             "offset": self.views.offset.tolist(),
+            "exposure": self.exposure.summary(),
             "refinement": {"steps": len(self.psnr), "psnr": self.psnr[-len(self.views.names) :]},
             "filtered": {"asked": asdict(self.filters), "left_out": self.removed},
         }

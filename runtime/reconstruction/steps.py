@@ -10,7 +10,7 @@ from ..errors import InputError
 from ..inference.bundled_model import bundled_model
 from ..inference.model_files import ModelFiles
 from ..inference.predictor import Prediction
-from ..refinement.options import RefinementOptions, default_steps, options_for
+from ..refinement.options import RefinementOptions, options_for
 from ..refinement.refine import refine
 from ..refinement.views import posed_image
 from ..splats.filtering import FilterOptions, describe_removed, filter_gaussians
@@ -41,9 +41,8 @@ class Plan:
 
     def refinement(self, views: int) -> RefinementOptions:
         """The options of the refinement on so many views."""
-        limit = self.limit or RefinementLimit(None if self.preset.steps_per_view else 0, self.preset.seconds)
-        steps = default_steps(views, self.preset.steps_per_view) if limit.steps is None else limit.steps
-        return options_for(views, steps=steps, seconds=limit.seconds, max_gaussians=self.max_gaussians)
+        limit = self.limit or RefinementLimit(views * self.preset.steps_per_view, self.preset.seconds)
+        return options_for(views, steps=limit.steps, seconds=limit.seconds, max_gaussians=self.max_gaussians)
 
 
 @dataclass(frozen=True)

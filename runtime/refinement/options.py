@@ -3,13 +3,11 @@
 from dataclasses import dataclass
 from typing import Any
 
-# Few views overfit: what they share is little, and what suits their own images is wrong for others. Measured on
-# held-out views: with two, opacities stay as they are and steps are few; with six, saturated opacities hide what lies
-# behind.
+# Measured on held-out views of real captures (docs/reconstruction.md): the network's Gaussians are small and opaque, so
+# that a layer that is nearer by a hair hides the others; larger ones that let light through have gradients and average.
 FEW_VIEWS = 2
-FEW_VIEWS_STEPS = 8  # of each view
-FEW_VIEWS_OPACITY, FEW_VIEWS_SCALE = 0.99, 1.05
-MANY_VIEWS_OPACITY, MANY_VIEWS_SCALE = 0.7, 1.1
+FEW_VIEWS_OPACITY, FEW_VIEWS_SCALE = 0.9, 2.0
+MANY_VIEWS_OPACITY, MANY_VIEWS_SCALE = 0.7, 1.5
 
 
 @dataclass(frozen=True)
@@ -39,11 +37,6 @@ class RefinementOptions:
     lr_sh: float = 1e-3
     lr_exposure: float = 1e-3
     final_lr: float = 0.1
-
-
-def default_steps(views: int, per_view: int) -> int:
-    """Steps for so many views: `per_view` of each, or FEW_VIEWS_STEPS where they are few."""
-    return views * min(per_view, FEW_VIEWS_STEPS if views <= FEW_VIEWS else per_view)
 
 
 def options_for(views: int, steps: int, **options: Any) -> RefinementOptions:

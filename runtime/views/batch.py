@@ -4,6 +4,7 @@ import logging
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -19,6 +20,7 @@ from ..images.finding import image_stem
 from ..images.header import DamagedImage
 from .depth_range import scene_depths
 from .loader import FeatureImage, ImageCameraPair, ViewLoader
+from .matching import ViewMatcher
 from .selection import MIN_VIEWS, score_pairs, select_views
 
 LOG = logging.getLogger(__name__)
@@ -57,6 +59,11 @@ class ViewBatch:
     feature_images: Sequence[FeatureImage] = ()
     skipped: Sequence[str] = ()
     copies: Sequence[UndistortedImage] = ()
+
+    @cached_property
+    def matcher(self) -> ViewMatcher:
+        """Points matched between the views; what it has matched is kept with the batch."""
+        return ViewMatcher(self.images, self.extrinsics, self.intrinsics, self.feature_images)
 
 
 def match_images_to_cameras(images: Sequence[Path], cameras: Sequence[Camera]) -> list[tuple[Path, Camera]]:

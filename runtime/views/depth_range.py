@@ -10,25 +10,15 @@ from ..cameras.camera import Camera
 from ..errors import InputError
 from ..geometry.baselines import nearest_neighbor_pairs
 from ..geometry.depth_bounds import MIN_POINTS, depth_bounds
-from ..geometry.intrinsics import denormalize_intrinsics
 from ..geometry.rigid import invert_rigid
-from ..images.colormaps import to_uint8
-from ..sfm.features import (
-    Features,
-    extract_features,
-    match_features,
-    normalize_points,
-    parallax_angles,
-    sampson_distance,
-    triangulate,
-)
+from ..sfm.features import Features, parallax_angles, triangulate
 from .loader import FeatureImage
+from .matching import PointMatches, ViewMatcher, match_along_epipolar_lines
 from .selection import PairScorer, guess_scene_depths
 
 LOG = logging.getLogger(__name__)
 
 SAMPLED_IMAGES = 3  # that are matched, with two others each, for the depth of the scene
-MAX_EPIPOLAR_ERROR = 1.5  # pixels
 MIN_PARALLAX_DEG = 0.3  # with less, a triangulated depth is mostly noise
 
 
@@ -49,11 +39,11 @@ def estimate_depth_range(
     trained: tuple[float, float],
     near: float | None = None,
     far: float | None = None,
-    feature_images: Sequence[FeatureImage] = (),
+    matcher: ViewMatcher | None = None,
 ) -> DepthRange:
     """Estimate near and far of these views; given values are kept.
 
-    feature_images: one for each view, or none; features are extracted from them instead of the smaller `images`.
+    matcher: of these views; without one, features are extracted from `images`.
     Sources, in order: the cameras' depth ranges; points that are matched between the views and triangulated; the
     baseline: near is then the longest distance between a view and its nearest neighbour, since closer points have too
     much parallax for matching, and far / near is that of `trained`, the near and far of the model's training.
@@ -63,7 +53,7 @@ def estimate_depth_range(
         return _checked(DepthRange(near, far, "given"))
     found = (
         _from_cameras(cameras)
-        or _from_matches(images, extrinsics, intrinsics, feature_images)
+        or _from_matches(matcher or ViewMatcher(images, extrinsics, intrinsics))
         or _from_baseline(extrinsics, trained)
     )
     if near is not None:
@@ -90,32 +80,13 @@ def _from_cameras(cameras: Iterable[Camera]) -> DepthRange | None:
     return DepthRange(min(near for near, _ in ranges), max(far for _, far in ranges), "the cameras' depth ranges")
 
 
-def _from_matches(
-    images: np.ndarray, extrinsics: np.ndarray, intrinsics: np.ndarray, feature_images: Sequence[FeatureImage]
-) -> DepthRange | None:
-    if feature_images:
-        features = [_inside(*pair) for pair in zip(feature_images, intrinsics, strict=True)]
-        K = np.stack([feature_image.camera.K for feature_image in feature_images])
-    else:
-        height, width = images.shape[2:]
-        rgb = to_uint8(images).transpose(0, 2, 3, 1)
-        features = [extract_features(np.ascontiguousarray(image)) for image in rgb]
-        K = denormalize_intrinsics(intrinsics, width, height)  # [views, 3, 3]
+def _from_matches(matcher: ViewMatcher) -> DepthRange | None:
     depths = [np.zeros(0)]
-    for i, j in nearest_neighbor_pairs(extrinsics):
-        depths += triangulated_depths(features[i], features[j], K[i], K[j], invert_rigid(extrinsics[j]) @ extrinsics[i])
+    for i, j in nearest_neighbor_pairs(matcher.extrinsics):
+        depths += _triangulate(matcher.match(i, j))
     depth = np.concatenate(depths)  # two depths for each point
     found = depth_bounds(depth)
     return found and DepthRange(*found, f"{len(depth) // 2} points matched between the images")
-
-
-def _inside(feature_image: FeatureImage, intrinsics: np.ndarray) -> Features:
-    """The features inside the network's crop of the image, which has these normalised intrinsics [3, 3]."""
-    features = feature_image.features
-    points = normalize_points(features.keypoints, feature_image.camera.K)
-    position = points * np.diag(intrinsics)[:2] + intrinsics[:2, 2]  # in the crop, in [0, 1]
-    inside = ((position >= 0) & (position <= 1)).all(axis=1)
-    return Features(features.keypoints[inside], features.descriptors[inside])
 
 
 def triangulated_depths(
@@ -126,16 +97,14 @@ def triangulated_depths(
     first_K, second_K: in pixels, [3, 3]. second_from_first: transforms points from the first camera's frame to the
     second's, [4, 4].
     """
-    pairs = match_features(first, second)
-    a, b = (
-        normalize_points(first.keypoints[pairs[:, 0]], first_K),
-        normalize_points(second.keypoints[pairs[:, 1]], second_K),
-    )
-    pixel = 1 / np.sqrt(first_K[0, 0] * second_K[0, 0])
-    inliers = sampson_distance(a, b, second_from_first) < MAX_EPIPOLAR_ERROR * pixel
-    points = triangulate(a[inliers], b[inliers], second_from_first)
-    in_second = points @ second_from_first[:3, :3].T + second_from_first[:3, 3]
-    angle = parallax_angles(points, invert_rigid(second_from_first)[:3, 3])
+    return _triangulate(match_along_epipolar_lines(first, second, first_K, second_K, second_from_first))
+
+
+def _triangulate(matches: PointMatches) -> tuple[np.ndarray, np.ndarray]:
+    """`triangulated_depths` of these matches."""
+    points = triangulate(matches.first, matches.second, matches.second_from_first)
+    in_second = points @ matches.second_from_first[:3, :3].T + matches.second_from_first[:3, 3]
+    angle = parallax_angles(points, invert_rigid(matches.second_from_first)[:3, 3])
     valid = (points[:, 2] > 0) & (in_second[:, 2] > 0) & (angle > MIN_PARALLAX_DEG)
     return points[valid, 2], in_second[valid, 2]
 

@@ -338,6 +338,7 @@ BAD = {
     "a provider that is not installed": (nothing, ("--provider", "CUDA"), "CUDA"),
     "an output folder that nobody may write to": (nothing, ("--out", "/proc/scene.ply"), "cannot write into /proc"),
     "an output folder that nobody may make": (nothing, ("--out", "/proc/a/b.ply"), "cannot write into /proc"),
+    "an exposure that is none": (nothing, ("--exposure", "on"), "--exposure"),
     "a range beyond the images": (nothing, ("--select", "0-5"), "--select 0-5: no image is called so"),
     "a range that ends before it begins": (nothing, ("--select", "3-1"), "--select 3-1: no image is called so"),
     "a slice beyond the images": (nothing, ("--select", "0:9"), "--select 0:9: no image is called so"),

@@ -13,8 +13,8 @@ from idesplat.runtime.cameras.io import read_cameras
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.inference.inputs import Request, read_inputs
 from idesplat.runtime.sfm import estimate
-from idesplat.runtime.views import depth_range, sources
 from idesplat.runtime.views import loader as view_loader
+from idesplat.runtime.views import matching, sources
 from idesplat.runtime.views.depth_range import estimate_depth_range
 from idesplat.tools.synthetic.make_scene import make_scene
 from PIL import ImageFile
@@ -88,7 +88,7 @@ def counted(monkeypatch) -> Counter:
 
     monkeypatch.setattr(cv2, "imdecode", counting("decoded", cv2.imdecode))
     monkeypatch.setattr(ImageFile.ImageFile, "load", counting("decoded", ImageFile.ImageFile.load))
-    for module in (view_loader, depth_range, estimate):
+    for module in (view_loader, matching, estimate):
         monkeypatch.setattr(module, "extract_features", counting("sift", module.extract_features))
     return counter
 
@@ -96,7 +96,7 @@ def counted(monkeypatch) -> Counter:
 def ranged(inputs):
     views = inputs.views
     arrays = views.images, views.extrinsics, views.intrinsics
-    return estimate_depth_range(*arrays, views.cameras, (1.0, 100.0), feature_images=views.feature_images)
+    return estimate_depth_range(*arrays, views.cameras, (1.0, 100.0), matcher=views.matcher)
 
 
 def test_an_image_is_decoded_once_and_only_if_it_is_used(capture, counted):

@@ -6,14 +6,14 @@ from types import SimpleNamespace
 import pytest
 from idesplat import InputError
 from idesplat.runtime.inference.bundled_model import bundled_model
-from idesplat.runtime.reconstruction.quality import PRESETS, Quality, RefinementLimit, parse_refine
+from idesplat.runtime.reconstruction.quality import MAX_STEPS, PRESETS, Quality, RefinementLimit, parse_refine
 from idesplat.runtime.reconstruction.steps import make_plan
 from idesplat.runtime.splats.filtering import FilterOptions
 
 
 @pytest.mark.parametrize(
     ("text", "limit"),
-    [("0", RefinementLimit(0)), ("120", RefinementLimit(120)), ("30s", RefinementLimit(None, 30.0))],
+    [("0", RefinementLimit(0)), ("120", RefinementLimit(120)), ("30s", RefinementLimit(MAX_STEPS, 30.0))],
 )
 def test_refine_is_steps_or_seconds(text: str, limit: RefinementLimit) -> None:
     assert parse_refine(text) == limit
@@ -41,9 +41,10 @@ def test_the_bundled_model_is_refined_by_default_and_others_are_left_as_they_pre
 def test_refine_overrides_the_quality() -> None:
     assert plan("standard", "0").copy_side == 0
     assert plan("fast", "40").refinement(2).steps == 40
-    assert plan("high", "25s").refinement(6).seconds == 25
+    for quality in ("fast", "high"):
+        timed = plan(quality, "25s").refinement(6)
+        assert timed.seconds == 25 and timed.steps == MAX_STEPS
     assert plan("standard").refinement(6).steps == 6 * PRESETS[Quality.STANDARD].steps_per_view
-    assert plan("standard").refinement(2).steps < 2 * PRESETS[Quality.STANDARD].steps_per_view
 
 
 def test_a_limit_on_the_gaussians_alone_changes_none_of_those_that_stay() -> None:

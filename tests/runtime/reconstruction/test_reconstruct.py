@@ -64,6 +64,29 @@ def test_what_a_reconstruction_holds_and_saves(place, scene):
     assert made.summary()["filtered"]["left_out"] == made.removed
 
 
+def test_exposures_are_compensated_unless_it_is_switched_off(place, scene):
+    cameras = {Path(camera.name).name: camera for camera in read_cameras(scene / "transforms.json")}
+    images = [load_image(scene / "images" / name) for name in NAMES]
+
+    def made(images, **options) -> Reconstruction:
+        return run(scene, images=images, cameras=[cameras[name] for name in NAMES], **options)
+
+    same, plain = made(images), made(images, exposure="off")
+    assert np.array_equal(same.views.images, plain.views.images) and np.array_equal(same.depth, plain.depth)
+    assert not any("exposure" in line for line in same.notes)
+    assert same.summary()["exposure"]["compensated"] is plain.summary()["exposure"]["compensated"] is False
+    assert plain.summary()["exposure"]["difference"] is None
+
+    darker = [images[0], (0.8 * images[1]).astype(np.uint8)]
+    found, left = made(darker), made(darker, exposure="off")
+    summary = found.summary()["exposure"]
+    assert summary["difference"] == pytest.approx(0.25, abs=0.04) and summary["compensated"]
+    assert np.divide(*summary["gains"]) == pytest.approx(np.full(3, 0.8), abs=0.03)
+    assert len([line for line in found.notes if "exposure differs by" in line]) == 1
+    assert np.array_equal(found.views.images, found.exposure.apply(left.views.images))
+    assert not np.array_equal(found.views.images, left.views.images) and left.exposure.is_identity
+
+
 def test_inputs_are_checked_before_the_model_is_loaded(place, scene, monkeypatch):
     monkeypatch.setattr(pipeline, "Predictor", lambda *given: pytest.fail("loaded"))
 
@@ -74,6 +97,8 @@ def test_inputs_are_checked_before_the_model_is_loaded(place, scene, monkeypatch
         run(scene, on_inputs=fail)
     with pytest.raises(InputError, match="expected near < far"):
         run(scene, near=3.0, far=2.0)
+    with pytest.raises(InputError, match="exposure on: expected one of auto, off"):
+        run(scene, exposure="on")
     with pytest.raises(InputError, match="no such"):
         run(scene, model="missing.onnx")
     with pytest.raises(InputError, match="a Camera for each"):

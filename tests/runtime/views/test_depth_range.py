@@ -30,7 +30,7 @@ def ranged(pairs, **given):
         views.intrinsics,
         views.cameras,
         TRAINED,
-        feature_images=views.feature_images,
+        matcher=views.matcher,
         **given,
     )
 
