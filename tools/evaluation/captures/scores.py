@@ -1,7 +1,7 @@
 """Evaluation of one capture: held-out frames rendered from pairs of views and from longer windows of views."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from ....runtime.inference.predictor import Predictor
 from ....runtime.splats.gaussians import Gaussians
 from ..baselines import best_fronto_parallel_plane, nearest_view
 from ..cases import EvalCase
-from ..metrics import LPIPS, fit_exposure, psnr, ssim
+from ..metrics import PerceptualMetric, fit_exposure, psnr, ssim
 from ..novel_views import MODEL, NEAREST, ORACLE_PLANE, Scores, comparison_strip, render_target
 from .capture import PAIR, Capture, CaptureImages
 
@@ -59,10 +59,10 @@ class CaptureScores:
 
 
 class CaptureEvaluator:
-    """Evaluates a model on captures; lpips: None where it cannot be computed."""
+    """Evaluates a model on captures; perceptual: distances by name."""
 
-    def __init__(self, predictor: Predictor, lpips: LPIPS | None) -> None:
-        self.predictor, self.lpips = predictor, lpips
+    def __init__(self, predictor: Predictor, perceptual: Mapping[str, PerceptualMetric]) -> None:
+        self.predictor, self.perceptual = predictor, perceptual
 
     def evaluate(
         self, capture: Capture, images: CaptureImages, counts: Sequence[int], show: Show | None = None
@@ -141,9 +141,7 @@ class CaptureEvaluator:
             "psnr_fitted": psnr(fit_exposure(image, truth, valid), truth, valid),
             "ssim": ssim(image, truth, valid),
         }
-        if self.lpips is not None:
-            scores["lpips"] = self.lpips(image, truth, valid)
-        return scores
+        return scores | {name: metric(image, truth, valid) for name, metric in self.perceptual.items()}
 
 
 def mean_of_captures(results: Sequence[CaptureScores], count: int) -> Scores:
