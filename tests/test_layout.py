@@ -44,7 +44,7 @@ LAZY = {
     "tools.benchmark.worker": "measures what each import costs its process",
     "tools.evaluation.cases": "numba takes time to load, and is needed for synthetic scenes alone",
     "tools.evaluation.evaluate": "numba takes time to load, and is needed for synthetic scenes alone",
-    "tools.evaluation.metrics": "PyTorch is optional, and needed for LPIPS alone",
+    "tools.evaluation.metrics": "PyTorch is optional, and needed for perceptual distances alone",
     "tools.synthetic.make_scene": "a command",
 }
 

@@ -123,8 +123,9 @@ def _warped(
     half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # OpenCV's pixel centres are at integers
     maps = np.linalg.inv(half) @ homography @ half
     size, inverse = (width, height), cv2.WARP_INVERSE_MAP
-    image = np.ascontiguousarray(context.image(view))
-    image = cv2.warpPerspective(image, maps, size, flags=cv2.INTER_LINEAR | inverse, borderMode=cv2.BORDER_REPLICATE)
+    image = cv2.warpPerspective(
+        context.image(view), maps, size, flags=cv2.INTER_LINEAR | inverse, borderMode=cv2.BORDER_REPLICATE
+    )
     seen = cv2.warpPerspective(context.valid[view].astype(np.uint8), maps, size, flags=cv2.INTER_NEAREST | inverse)
     in_front = maps[2, 0] * np.arange(width) + maps[2, 1] * np.arange(height)[:, None] + maps[2, 2] > 0
     return image, (seen > 0) & in_front

@@ -1,6 +1,7 @@
 """Evaluation cases: context views for a network, and held-out target views."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -33,8 +34,13 @@ class PosedImages:
         return len(self.names)
 
     def image(self, view: int) -> np.ndarray:
-        """One image, [height, width, 3]."""
-        return self.images[view].transpose(1, 2, 0)
+        """One image, [height, width, 3], contiguous."""
+        return self._rgb[view]
+
+    @cached_property
+    def _rgb(self) -> np.ndarray:
+        # The search for the best plane reads each image hundreds of times, and OpenCV needs them contiguous.
+        return np.ascontiguousarray(self.images.transpose(0, 2, 3, 1))
 
     def K(self, view: int) -> np.ndarray:
         """One view's intrinsics in pixels, pixel centres at .5, [3, 3], float64."""

@@ -32,7 +32,7 @@ from .cases import EvalCase, synthetic_case
 from .chunks import NEAR_PLANE_FACTOR, chunk_cases, find_chunks, read_index
 from .defaults import CONTEXT_VIEWS, HELD_OUT_SCENES, HOLD_OUT_EVERY, SYNTHETIC_TARGETS, VIEW_COUNTS
 from .image_folders import load_case, split_frames
-from .metrics import LPIPS, check_ssim, load_lpips
+from .metrics import LITE0, LPIPS, PerceptualMetric, check_ssim, load_lite0, load_lpips
 from .novel_views import Evaluator, Result, Scores, mean_of_scenes, mean_of_views
 
 # Receives a scene's metrics and, by target, its strip: truth, render, error, depth and, if measured, the oracle plane.
@@ -114,8 +114,8 @@ def evaluate(
         predictor.model.check_size(len(given), *shape)
     find_range = partial(predictor.depth_range, near=near, far=far)
     cases = (load_case(frames, *split, shape, find_range, depth) for split in splits)
-    lpips, warnings = _load_metrics()
-    results = _evaluate_cases(cases, len(splits), Evaluator(predictor, lpips), on_scene)
+    perceptual, warnings = _load_metrics()
+    results = _evaluate_cases(cases, len(splits), Evaluator(predictor, perceptual), on_scene)
     return _evaluation(predictor, shape, mean_of_views(results), results, warnings=warnings)
 
 
@@ -144,8 +144,8 @@ def evaluate_chunks(
         raise InputError(
             f"near {near:g} and far {far:g}: expected 0 < near < far; give --near and --far in scene units"
         )
-    lpips, warnings = _load_metrics()
-    evaluator = Evaluator(predictor, lpips, compare=False, near_plane=NEAR_PLANE_FACTOR * near)
+    perceptual, warnings = _load_metrics()
+    evaluator = Evaluator(predictor, perceptual, compare=False, near_plane=NEAR_PLANE_FACTOR * near)
     skipped: dict[str, str] = {}
     cases = chunk_cases(files, entries, shape, (near, far), skipped.__setitem__)
     results = _evaluate_cases(cases, len(entries), evaluator, on_scene, skipped)
@@ -181,8 +181,8 @@ def evaluate_synthetic(
     if pool < views:
         raise InputError(f"--pool-views {pool}: expected at least the {views} of --views")
     cases = (synthetic_case(seed, views, pool, SYNTHETIC_TARGETS, *shape) for seed in HELD_OUT_SEEDS[:scenes])
-    lpips, warnings = _load_metrics()
-    results = _evaluate_cases(cases, scenes, Evaluator(predictor, lpips), on_scene)
+    perceptual, warnings = _load_metrics()
+    results = _evaluate_cases(cases, scenes, Evaluator(predictor, perceptual), on_scene)
     return _evaluation(predictor, shape, mean_of_scenes(results), results, warnings=warnings)
 
 
@@ -211,9 +211,9 @@ def evaluate_captures(
     for count in view_counts:
         predictor.model.check_size(count, *shape)
     folder = checkouts or clones_folder()
-    lpips, warnings = _load_metrics()
+    perceptual, warnings = _load_metrics()
     plan = make_plan(quality, predictor.model, refine, FilterOptions(), 0)
-    evaluator, found = CaptureEvaluator(predictor, lpips, plan), []
+    evaluator, found = CaptureEvaluator(predictor, perceptual, plan), []
     for capture in progress(chosen, "evaluating"):
         with scratch_folder() as images:
             checkout = fetch_checkout(folder, capture.repository, capture.commit)
@@ -227,13 +227,17 @@ def _opened(model: Model) -> Predictor:
     return Predictor(model or bundled_model()) if model is None or isinstance(model, Path | str) else model
 
 
-def _load_metrics() -> tuple[LPIPS | None, list[str]]:
-    """LPIPS, or None and why it cannot be computed. Raises InputError if there is no SSIM."""
+def _load_metrics() -> tuple[dict[str, PerceptualMetric], list[str]]:
+    """The perceptual distances by name, and why others cannot be computed. Raises InputError if there is no SSIM."""
     check_ssim()
-    try:
-        return load_lpips(), []
-    except InputError as error:
-        return None, [str(error)]
+    found: dict[str, PerceptualMetric] = {}
+    warnings = []
+    for name, load in ((LPIPS, load_lpips), (LITE0, load_lite0)):
+        try:
+            found[name] = load()
+        except InputError as error:
+            warnings.append(str(error))
+    return found, warnings
 
 
 def _evaluate_cases(

@@ -1,12 +1,16 @@
-"""Image and depth metrics: PSNR, SSIM, LPIPS, AbsRel, delta < 1.25 and the inlier ratio at 1.05."""
+"""Image and depth metrics: PSNR, SSIM, perceptual distances, AbsRel, delta < 1.25 and the inlier ratio at 1.05."""
 
 from collections.abc import Callable
 from importlib.util import find_spec
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
 from ...runtime.errors import InputError
+
+if TYPE_CHECKING:
+    from ..training.perceptual import Perceptual
 
 # SSIM as Wang et al. (2004) define it and the releases compute it with scikit-image.
 SSIM_WINDOW = 11
@@ -16,7 +20,10 @@ HIGHEST_PSNR = 100.0
 DELTA, INLIER = 1.25, 1.05
 INSTALL = "pip install 'idesplat[eval]'"
 
-LPIPS = Callable[[np.ndarray, np.ndarray, np.ndarray], float]
+LPIPS, LITE0 = "lpips", "lite0"  # perceptual distances
+LITE0_TITLE = "perceptual (Lite0)"
+# Image and truth [height, width, 3], and valid [height, width] -> a distance.
+PerceptualMetric = Callable[[np.ndarray, np.ndarray, np.ndarray], float]
 
 
 def psnr(image: np.ndarray, truth: np.ndarray, valid: np.ndarray) -> float:
@@ -71,26 +78,47 @@ def check_ssim() -> None:
         raise InputError(f"scikit-image is needed for SSIM, and is not installed; {INSTALL}")
 
 
-def load_lpips() -> LPIPS:
-    """LPIPS with VGG16 (Zhang et al. 2018) as a function of image, truth and valid, like the other metrics.
+def load_lpips() -> PerceptualMetric:
+    """LPIPS with VGG16 (Zhang et al. 2018); invalid pixels are given the truth's colour.
 
-    Invalid pixels are given the truth's colour. Raises InputError if torch, lpips or VGG16's weights are missing.
+    Raises InputError if torch, lpips or VGG16's weights are missing.
     """
+    _check_torch("LPIPS")
+    from ..training import perceptual
+
+    return _as_metric(perceptual.load_lpips())
+
+
+def load_lite0() -> PerceptualMetric:
+    """The distance of EfficientNet-Lite0's features that training uses, too (`EfficientNetDistance`).
+
+    Invalid pixels are given the truth's colour. Raises InputError if torch or the network's weights are missing.
+    """
+    _check_torch(LITE0_TITLE)
+    from ..training import perceptual
+
     try:
-        import torch
+        return _as_metric(perceptual.EfficientNetDistance())
+    except InputError as error:
+        raise InputError(f"{LITE0_TITLE} is left out: {error}") from None
 
-        from ..training.perceptual import load_lpips_network
-    except ImportError as error:
-        raise InputError(f"LPIPS is left out, since the package {error.name} is not installed") from None
-    network = load_lpips_network()
 
-    def distance(image: np.ndarray, truth: np.ndarray, valid: np.ndarray) -> float:
-        shown = np.where(valid[..., None], image, truth)
+def _check_torch(metric: str) -> None:
+    if find_spec("torch") is None:
+        raise InputError(f"{metric} is left out, since the package torch is not installed")
+
+
+def _as_metric(distance: "Perceptual") -> PerceptualMetric:
+    """A distance of batches of tensors as a function of image, truth and valid, like the other metrics."""
+    import torch
+
+    def metric(image: np.ndarray, truth: np.ndarray, valid: np.ndarray) -> float:
+        shown = np.where(valid[..., None], image.clip(0, 1), truth)
         first, second = (torch.from_numpy(x.astype(np.float32)).permute(2, 0, 1)[None] for x in (shown, truth))
         with torch.no_grad():
-            return float(network(first, second, normalize=True).mean())
+            return float(distance(first, second))
 
-    return distance
+    return metric
 
 
 def depth_measures(depth: np.ndarray, truth: np.ndarray) -> dict[str, float]:

@@ -1,6 +1,6 @@
 """Evaluation of one case: target views rendered from a model's Gaussians, and compared with the baselines."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,7 @@ from ...runtime.rendering.types import Rendering
 from ...runtime.splats.gaussians import Gaussians
 from .baselines import best_fronto_parallel_plane, nearest_view, oracle_depth_splats
 from .cases import EvalCase, PosedImages
-from .metrics import LPIPS, depth_measures, psnr, ssim
+from .metrics import PerceptualMetric, depth_measures, psnr, ssim
 
 MODEL, NEAREST, ORACLE_PLANE, ORACLE_DEPTH = "model", "nearest", "oracle_plane", "oracle_depth"
 # Default near plane of target renderings, in scene units.
@@ -58,12 +58,12 @@ class Result:
 class Evaluator:
     """Evaluates a model on cases.
 
-    lpips: None where it cannot be computed. compare: whether the baselines are evaluated, too.
+    perceptual: distances by name. compare: whether the baselines are evaluated, too.
     near_plane: of target renderings, in scene units.
     """
 
     predictor: Predictor
-    lpips: LPIPS | None
+    perceptual: Mapping[str, PerceptualMetric]
     compare: bool = True
     near_plane: float = NEAR_PLANE
 
@@ -116,9 +116,7 @@ class Evaluator:
         scores = {"psnr": psnr(image, truth, valid), "ssim": ssim(image, truth, valid)}
         if covisible is not None:
             scores["psnr_covisible"] = psnr(image, truth, covisible)
-        if self.lpips is not None:
-            scores["lpips"] = self.lpips(image, truth, valid)
-        return scores
+        return scores | {name: metric(image, truth, valid) for name, metric in self.perceptual.items()}
 
 
 def mean_of_views(results: Sequence[Result]) -> Scores:

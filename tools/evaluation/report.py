@@ -12,6 +12,7 @@ from rich.table import Table
 from ...runtime.cli.terminal import literal, say
 from ...runtime.system.files import atomic_write
 from ...runtime.system.output_names import RESULTS
+from .metrics import LITE0, LITE0_TITLE, LPIPS
 from .novel_views import MODEL, NEAREST, ORACLE_DEPTH, ORACLE_PLANE, Result, Scores
 
 if TYPE_CHECKING:
@@ -21,7 +22,8 @@ TITLES = {
     "psnr": "PSNR, dB",
     "psnr_covisible": "PSNR co-visible, dB",
     "ssim": "SSIM",
-    "lpips": "LPIPS",
+    LPIPS: "LPIPS",
+    LITE0: LITE0_TITLE,
     "abs_rel": "AbsRel",
     "delta_1.25": "delta < 1.25",
     "inlier_ratio_1.05": "inlier ratio at 1.05",

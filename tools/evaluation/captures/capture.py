@@ -6,6 +6,7 @@
   {"name": "fountain", "kind": "facade", "content": "...", "licence": "...",
    "repository": "OWNER/NAME", "commit": "<40 hex digits>", "folder": "path/of/its/images",
    "cameras": "estimated",                 or the path of the camera file in the repository
+   "crop": [left, top, right, bottom],     of each image, in pixels, or null; the lenses are those of the crop
    "epipolar_px": 0.11,                    median distance of SIFT matches from their epipolar lines, at 640 pixels
    "lenses": [{"width": 768, "height": 512, "K": [fx, fy, cx, cy], "distortion": null}],
    "frames": [["0000.png", 0, [qw, qx, qy, qz], [x, y, z], [near, far]]],
@@ -33,7 +34,7 @@ from ....runtime.images.io import load_image
 from ....runtime.system.limits import parse_whole_number
 from ....runtime.views.batch import ViewBatch
 from ....runtime.views.depth_range import DepthRange
-from ....runtime.views.loader import load_view
+from ....runtime.views.loader import ImageCameraPair, load_view
 from ..cases import EvalCase, PosedImages
 from ..image_folders import valid_pixels
 
@@ -43,6 +44,7 @@ PAIR = 2  # context views of a triple
 MAX_VIEWS = 24  # of a path
 
 FindRange = Callable[[ViewBatch], DepthRange]
+Crop = tuple[int, int, int, int]  # left, top, right, bottom in pixels
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,7 @@ class Capture(CaptureSource):
     triples: list[Triple]
     views: list[str]
     between: list[str]
+    crop: Crop | None = None
 
     @property
     def frames(self) -> list[str]:
@@ -85,9 +88,9 @@ class Capture(CaptureSource):
 
         A window of more views contains every smaller one.
         """
-        first = (len(self.views) - count) // 2
-        if first < 0:
+        if count > len(self.views):
             return [], []
+        first = window_start(len(self.views), count)
         return self.views[first : first + count], self.between[first : first + count - 1]
 
     def neighbours(self, target: str) -> Triple:
@@ -116,9 +119,11 @@ class CaptureImages:
         self.capture, self.folder, self.size = capture, folder, size
         self._loaded: dict[str, LoadedFrame] = {}
 
-    def pairs(self, names: Sequence[str]) -> list[tuple[Path, Camera]]:
-        """Image files with their cameras, at the images' own size."""
-        return [(self.folder / name, self.capture.cameras[name]) for name in names]
+    def pairs(self, names: Sequence[str]) -> list[ImageCameraPair]:
+        """Images with their cameras, at the images' own size; files, or arrays where the capture is cropped."""
+        crop, cameras = self.capture.crop, self.capture.cameras
+        paths = {name: self.folder / name for name in names}
+        return [(path if crop is None else load_cropped(path, crop), cameras[name]) for name, path in paths.items()]
 
     def case(self, context: Sequence[str], targets: Sequence[str], find_range: FindRange) -> EvalCase:
         """Context and held-out frames as arrays, with near and far from the context views.
@@ -147,11 +152,25 @@ class CaptureImages:
 
     def _load(self, name: str) -> LoadedFrame:
         if name not in self._loaded:
-            image, camera = load_image(self.folder / name), self.capture.cameras[name]
+            image, camera = load_cropped(self.folder / name, self.capture.crop), self.capture.cameras[name]
             view = load_view((image, camera), *self.size)
             valid = valid_pixels(image, camera, *self.size)
             self._loaded[name] = LoadedFrame(view.image, view.intrinsics, view.camera, valid)
         return self._loaded[name]
+
+
+def load_cropped(path: Path, crop: Crop | None) -> np.ndarray:
+    """The image in a file, or a crop of it, uint8 RGB [height, width, 3]; raises InputError as `load_image`."""
+    image = load_image(path)
+    if crop is None:
+        return image
+    left, top, right, bottom = crop
+    return image[top:bottom, left:right]
+
+
+def window_start(views: int, count: int) -> int:
+    """The index of the first of the `count` views in the middle of a path of so many views."""
+    return (views - count) // 2
 
 
 def read_captures(names: Sequence[str] = (), path: Path | None = None) -> list[Capture]:
@@ -186,9 +205,8 @@ def _capture(entry: dict[str, Any]) -> Capture:
             described = {text: entry[text] for text in texts}
             if not all(isinstance(text, str) for text in described.values()):
                 raise TypeError(f"{', '.join(texts)} are not all strings")
-            capture = Capture(
-                **described, cameras=cameras, triples=triples, views=entry["views"], between=entry["between"]
-            )
+            parts = {"views": entry["views"], "between": entry["between"], "crop": _crop(entry.get("crop"))}
+            capture = Capture(**described, cameras=cameras, triples=triples, **parts)
         except (KeyError, IndexError, TypeError, ValueError) as error:
             raise InputError(f"is not as this version writes it ({error}); restore the file") from None
         try:
@@ -196,6 +214,15 @@ def _capture(entry: dict[str, Any]) -> Capture:
         except TypeError as error:
             raise InputError(f"is not as this version writes it ({error}); restore the file") from None
     return capture
+
+
+def _crop(value: Any) -> Crop | None:
+    if value is None:
+        return None
+    left, top, right, bottom = value
+    if not all(isinstance(side, int) for side in value) or not (0 <= left < right and 0 <= top < bottom):
+        raise ValueError(f"crop is {value}")
+    return left, top, right, bottom
 
 
 def _camera(lenses: list[dict[str, Any]], frame: list[Any]) -> Camera:

@@ -4,8 +4,10 @@
 
 For each capture: cameras from the repository, or estimated from the images; SIFT matches between neighbouring frames
 give the scene's depth and the epipolar distance, and frames whose cameras do not fit are left out. A triple is two
-frames whose baseline is about a quarter of the depth and a third one between them; triples in a row make a path of
-views. No model is run.
+frames whose baseline is about a quarter of the depth and a third one between them, which matches both; triples in a row
+make a path of views. No model is run.
+
+The file is frozen (docs/captures.md says why), so this is the record of how it was made; a test refuses other frames.
 """
 
 import json
@@ -24,19 +26,21 @@ from ....runtime.cli.terminal import run, say
 from ....runtime.errors import InputError
 from ....runtime.geometry.quaternions import matrices_to_quaternions
 from ....runtime.images.finding import SUFFIXES
+from ....runtime.images.png import save_png
 from ....runtime.sfm.estimate import estimate_cameras
 from ....runtime.system.files import atomic_write, make_folder
 from ....runtime.views.batch import match_images_to_cameras
-from .capture import CAPTURES_FILE, FORMAT, VERSION, CaptureSource
+from .capture import CAPTURES_FILE, FORMAT, MAX_VIEWS, VERSION, CaptureSource, load_cropped
 from .checkouts import extract, fetch_checkout, list_folder
-from .paths import TRIPLES, longest_path, spread_triples, triple_costs
+from .paths import TRIPLES, best_path, path_triples, spread_triples, triple_costs
 from .recipes import ESTIMATED, RECIPES, Recipe
-from .survey import cached_survey
+from .survey import EpipolarErrors, Survey, cached_survey
 
-# Least overlap of what two of three frames see, and largest baseline: the first that give triples, or a path of views.
+# Least overlap of what two of three frames see, and largest baseline. Triples have the first limits that give enough of
+# them; the path has looser ones only where these give more views.
 OVERLAP_AND_BASELINE = ((0.6, 0.4), (0.5, 0.5), (0.35, 0.8))
-MIN_VIEWS = 6  # of a path, where the last limits leave so many
-MAX_EPIPOLAR_PX = 1.0  # pixels, median over a frame's matches with a neighbour
+# Median over a frame's matches with its best neighbour, and over those of a held-out frame with the views beside it.
+MAX_EPIPOLAR_PX = 1.0
 DECIMALS = 9
 
 
@@ -64,16 +68,8 @@ def _choose(recipe: Recipe, checkouts: Path, work: Path) -> dict[str, Any]:
     pairs = [(path, replace(camera, name=path.name)) for path, camera in pairs]
     survey = cached_survey(work / recipe.name / "survey.npz", pairs)
     good = np.flatnonzero(survey.error < MAX_EPIPOLAR_PX)
-    positions = np.stack([camera.extrinsics[:3, 3] for _, camera in pairs])
-    triples: list[tuple[int, int, int]] = []
-    views: list[int] = []
-    between: list[int] = []
-    for limits in OVERLAP_AND_BASELINE:
-        cost = triple_costs(positions, survey, good, *limits)
-        if len(triples) < TRIPLES:
-            triples = spread_triples(cost, positions, survey)
-        if len(views) < MIN_VIEWS:
-            views, between = longest_path(cost, positions, survey)
+    extrinsics = np.stack([camera.extrinsics for _, camera in pairs])
+    triples, views, between = _select(extrinsics, survey, good, EpipolarErrors(pairs))
     if len(triples) < TRIPLES:
         raise InputError(f"{recipe.name}: {len(triples)} triples found, expected {TRIPLES}; leave the capture out")
     names = [path.name for path, _ in pairs]
@@ -87,12 +83,43 @@ def _choose(recipe: Recipe, checkouts: Path, work: Path) -> dict[str, Any]:
     return {
         **{field.name: getattr(recipe, field.name) for field in fields(CaptureSource)},
         "cameras": recipe.cameras,
+        "crop": recipe.crop,
         "epipolar_px": round(float(np.median(survey.error[used])), 2),
         **camera_entries([pairs[index][1] for index in used]),
         "triples": [[names[index] for index in triple] for triple in triples],
         "views": [names[index] for index in views],
         "between": [names[index] for index in between],
     }
+
+
+def _select(
+    extrinsics: np.ndarray, survey: Survey, good: np.ndarray, errors: EpipolarErrors
+) -> tuple[list[tuple[int, int, int]], list[int], list[int]]:
+    """Triples, and the views of a path with the frames between them; fewer where the frames do not give enough."""
+    positions = extrinsics[:, :3, 3]
+    triples: list[tuple[int, int, int]] = []
+    path: tuple[list[int], list[int]] = [], []
+    for limits in OVERLAP_AND_BASELINE:
+        cost = triple_costs(extrinsics, survey, good, *limits)
+        if len(triples) < TRIPLES:
+            triples = spread_triples(cost, positions, survey)
+            while _forbid_mismatches(cost, triples, errors):
+                triples = spread_triples(cost, positions, survey)
+        if len(path[0]) < MAX_VIEWS:
+            longer = best_path(cost, positions)
+            while _forbid_mismatches(cost, path_triples(*longer), errors):
+                longer = best_path(cost, positions)
+            path = max(path, longer, key=lambda path: len(path[0]))
+    return triples, *path
+
+
+def _forbid_mismatches(cost: np.ndarray, triples: Sequence[tuple[int, int, int]], errors: EpipolarErrors) -> bool:
+    """Make the cost of triples infinite in which a view does not match the held-out frame; whether there are any."""
+    links = [(view, target) for a, b, target in triples for view in (a, b)]
+    bad = [(view, target) for view, target in links if errors(view, target) >= MAX_EPIPOLAR_PX]
+    for view, target in bad:
+        cost[view, :, target] = cost[:, view, target] = np.inf
+    return bool(bad)
 
 
 def _frames(recipe: Recipe, checkouts: Path, work: Path) -> tuple[list[Path], list[Camera]]:
@@ -102,8 +129,12 @@ def _frames(recipe: Recipe, checkouts: Path, work: Path) -> tuple[list[Path], li
         name for name in list_folder(checkout, recipe.commit, recipe.folder) if Path(name).suffix.lower() in SUFFIXES
     ]
     names = sorted(found, key=lambda name: (len(name), name))[recipe.first : recipe.last : recipe.step]
+    names = [name for name in names if name not in recipe.excluded]
     missing = [name for name in names if not (work / name).exists()]
     extract(checkout, recipe.commit, recipe.folder, missing, work)
+    if recipe.crop is not None:
+        for name in missing:
+            save_png(work / name, load_cropped(work / name, recipe.crop) / np.float32(255))
     images = [work / name for name in names]
     if recipe.cameras != ESTIMATED:
         parent, _, name = recipe.cameras.rpartition("/")

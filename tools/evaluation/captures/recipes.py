@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from .capture import CaptureSource
+from .capture import CaptureSource, Crop
 
 ESTIMATED = "estimated"
 
@@ -12,14 +12,18 @@ class Recipe(CaptureSource):
     """How to make a capture of its images.
 
     cameras: a path in the repository, or ESTIMATED. first, last, step: the slice of the folder's images, in order.
+    excluded: names of images of these that are not used.
     focal: focal length for estimated cameras, as `idesplat cameras estimate` takes it.
+    crop: left, top, right and bottom in pixels of what is kept of each image, without a logo for example.
     """
 
     cameras: str
     first: int = 0
     last: int | None = None
     step: int = 1
+    excluded: tuple[str, ...] = ()
     focal: str | None = None
+    crop: Crop | None = None
 
 
 RECIPES = (
@@ -42,6 +46,18 @@ RECIPES = (
         "57e50c56a1e601e468e012e0814187e5f698825b",
         "dense/0/images",
         "dense/0/sparse",
+    ),
+    Recipe(
+        "desk",
+        "room",
+        "desk with two screens before a wall",
+        "none stated",
+        "Pradyumnak777/cv2-project-2",
+        "a16030a4e454ae1c1f632cdf0798d28225f77a1f",
+        "images",
+        ESTIMATED,
+        last=60,  # later the screens show something else
+        focal="874",  # as in its sparse_text/cameras.txt
     ),
     Recipe(
         "fruit",
@@ -104,6 +120,20 @@ RECIPES = (
         "rails/transforms.json",
     ),
     Recipe(
+        "truck",
+        "outdoors",
+        "lorry in a street",
+        "Tanks and Temples' own terms (non-commercial)",
+        "tamochaman-nu/gaussian-splatting",
+        "383ee4f4f1648134b2d41f3ce3eef980782c85db",
+        "data/tandt/truck/images",
+        ESTIMATED,
+        first=42,
+        last=136,  # once around it
+        excluded=("000061.jpg",),  # a man before the lorry
+        focal="580",  # half of that in its sparse/0/cameras.bin, which is of images twice as large
+    ),
+    Recipe(
         "plant",
         "vegetation",
         "potted plant on newspapers, living room",
@@ -123,6 +153,7 @@ RECIPES = (
         "30655651735acc321cbe9e9eb7560c7c9295a57a",
         "images",
         ESTIMATED,
-        step=3,
+        step=2,
+        crop=(200, 0, 960, 544),  # a caption and a logo stand at the left of each frame
     ),
 )

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 
 from ....runtime.cli.terminal import say
+from ..metrics import LITE0, LPIPS
 from ..novel_views import MODEL, NEAREST, ORACLE_PLANE, Scores
 from ..report import describe, print_table, write_json
 from .capture import PAIR
@@ -16,37 +17,40 @@ from .scores import PAIRS, CaptureScores, mean_of_captures
 if TYPE_CHECKING:
     from ..evaluate import CaptureEvaluation
 
-# Heading, method and metric of a column of means.
-COLUMNS = (
+Column = tuple[str, str, str]  # heading, method and metric
+# Of the means; those that were not measured are left out.
+COLUMNS: tuple[Column, ...] = (
     ("PSNR", MODEL, "psnr"),
     ("fitted", MODEL, "psnr_fitted"),
     ("SSIM", MODEL, "ssim"),
-    ("LPIPS", MODEL, "lpips"),
+    ("LPIPS", MODEL, LPIPS),
+    ("perceptual\n(Lite0)", MODEL, LITE0),
     ("nearest", NEAREST, "psnr"),
     ("oracle\nplane", ORACLE_PLANE, "psnr"),
     ("oracle plane,\nfitted", ORACLE_PLANE, "psnr_fitted"),
     ("from the\ntwo around", PAIRS, "psnr"),
     ("input\nviews", MODEL, "input_psnr"),
 )
-DECIMALS = {"ssim": 3, "lpips": 3}
+DECIMALS = {"ssim": 3, LPIPS: 3, LITE0: 3}
 
 
 def print_captures(results: Sequence[CaptureScores], counts: Sequence[int], size: str) -> None:
     """A row for each capture and number of views, then the means over captures."""
+    rows = [(result.name, count, result.mean(count)) for result in results for count in counts if count in result.cases]
+    measured = [column for column in COLUMNS if any(_value(means, column) is not None for _, _, means in rows)]
     table = Table()
     for heading in ("capture", "views"):
         table.add_column(heading)
-    for heading, _, _ in COLUMNS:
+    for heading, _, _ in measured:
         table.add_column(heading, justify="right")
-    for result in results:
-        for count in counts:
-            if count in result.cases:
-                table.add_row(result.name, str(count), *_cells(result.mean(count)))
+    for name, count, means in rows:
+        table.add_row(name, str(count), *(_cell(means, column) for column in measured))
     table.add_section()
     for count in counts:
         having = sum(count in result.cases for result in results)
         if having:
-            table.add_row(f"mean of {having}", str(count), *_cells(mean_of_captures(results, count)))
+            means = mean_of_captures(results, count)
+            table.add_row(f"mean of {having}", str(count), *(_cell(means, column) for column in measured))
     say(f"real captures at {size}, PSNR in dB; {PAIR} views: triples, more: the middle of a path of views")
     print_table(table)
 
@@ -73,6 +77,11 @@ def write_capture_results(folder: Path, result: "CaptureEvaluation") -> Path:
     return write_json(folder, content)
 
 
-def _cells(means: Scores) -> list[str]:
-    values = [(metric, means.get(method, {}).get(metric)) for _, method, metric in COLUMNS]
-    return ["" if value is None else f"{value:.{DECIMALS.get(metric, 2)}f}" for metric, value in values]
+def _cell(means: Scores, column: Column) -> str:
+    value = _value(means, column)
+    return "" if value is None else f"{value:.{DECIMALS.get(column[2], 2)}f}"
+
+
+def _value(means: Scores, column: Column) -> float | None:
+    _, method, metric = column
+    return means.get(method, {}).get(metric)

@@ -1,7 +1,7 @@
 """Evaluation of one capture: held-out frames rendered from pairs of views and from longer windows of views."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from ....runtime.views.batch import ViewBatch
 from ....runtime.views.depth_range import DepthRange
 from ..baselines import best_fronto_parallel_plane, nearest_view
 from ..cases import EvalCase, PosedImages
-from ..metrics import LPIPS, fit_exposure, psnr, ssim
+from ..metrics import PerceptualMetric, fit_exposure, psnr, ssim
 from ..novel_views import MODEL, NEAREST, ORACLE_PLANE, Scores, comparison_strip, render_target
 from .capture import PAIR, Capture, CaptureImages
 
@@ -67,10 +67,10 @@ class CaptureScores:
 
 
 class CaptureEvaluator:
-    """Evaluates a model on captures; lpips: None where it cannot be computed. plan: what follows the prediction."""
+    """Evaluates a model on captures; perceptual: distances by name. plan: what follows the prediction."""
 
-    def __init__(self, predictor: Predictor, lpips: LPIPS | None, plan: Plan) -> None:
-        self.predictor, self.lpips, self.plan = predictor, lpips, plan
+    def __init__(self, predictor: Predictor, perceptual: Mapping[str, PerceptualMetric], plan: Plan) -> None:
+        self.predictor, self.perceptual, self.plan = predictor, perceptual, plan
 
     def evaluate(
         self, capture: Capture, images: CaptureImages, counts: Sequence[int], show: Show | None = None
@@ -153,9 +153,7 @@ class CaptureEvaluator:
             "psnr_fitted": psnr(fit_exposure(image, truth, valid), truth, valid),
             "ssim": ssim(image, truth, valid),
         }
-        if self.lpips is not None:
-            scores["lpips"] = self.lpips(image, truth, valid)
-        return scores
+        return scores | {name: metric(image, truth, valid) for name, metric in self.perceptual.items()}
 
 
 def mean_of_captures(results: Sequence[CaptureScores], count: int) -> Scores:

@@ -36,6 +36,29 @@ class Survey:
     baseline: np.ndarray
 
 
+class EpipolarErrors:
+    """Median epipolar distance of two frames' matches in pixels, infinite where few match.
+
+    Features are extracted when a frame is first asked for.
+    """
+
+    def __init__(self, pairs: Sequence[tuple[Path, Camera]]) -> None:
+        self._pairs = pairs
+        self._samples: dict[int, FeatureImage] = {}
+        self._errors: dict[tuple[int, int], float] = {}
+
+    def __call__(self, first: int, second: int) -> float:
+        """The distance for two frames, by index."""
+        if (first, second) not in self._errors:
+            self._errors[first, second], _ = _epipolar(self._sample(first), self._sample(second))
+        return self._errors[first, second]
+
+    def _sample(self, index: int) -> FeatureImage:
+        if index not in self._samples:
+            self._samples[index] = _sample(*self._pairs[index])
+        return self._samples[index]
+
+
 def cached_survey(path: Path, pairs: Sequence[tuple[Path, Camera]]) -> Survey:
     """The survey of frames, cached in a file."""
     if not path.exists():
