@@ -92,8 +92,10 @@ def read_inputs(request: Request, model: ModelFiles) -> Inputs:
         count = min(posed.wanted or len(pairs), len(pairs))
         model.check_size(max(count, MIN_VIEWS), height, width)
         with working("choosing and reading images"):
-            views = build_view_batch(pairs, count, height, width, skip_damaged=request.select is None)
-    notes += [f"{line}; left out" for line in views.skipped]
+            # Estimated cameras have been checked against the same matches.
+            checked = {"check_images": True, "check_cameras": posed.source != ESTIMATE}
+            views = build_view_batch(pairs, count, height, width, skip_damaged=request.select is None, **checked)
+    notes += [f"{line}; left out" for line in views.skipped] + [f"warning: {line}" for line in views.warnings]
     if request.views and request.views > len(pairs):
         notes.append(f"--views {request.views}: all {len(pairs)} images used; there are no more with a camera")
     notes += _describe_crop(views.cameras[0], height, width, model)

@@ -94,7 +94,7 @@ def _from_matches(
     images: np.ndarray, extrinsics: np.ndarray, intrinsics: np.ndarray, feature_images: Sequence[FeatureImage]
 ) -> DepthRange | None:
     if feature_images:
-        features = [_inside(*pair) for pair in zip(feature_images, intrinsics, strict=True)]
+        features = [feature_image.inside for feature_image in feature_images]
         K = np.stack([feature_image.camera.K for feature_image in feature_images])
     else:
         height, width = images.shape[2:]
@@ -103,30 +103,28 @@ def _from_matches(
         K = denormalize_intrinsics(intrinsics, width, height)  # [views, 3, 3]
     depths = [np.zeros(0)]
     for i, j in nearest_neighbor_pairs(extrinsics):
-        depths += triangulated_depths(features[i], features[j], K[i], K[j], invert_rigid(extrinsics[j]) @ extrinsics[i])
+        matches = feature_images[i].match(feature_images[j]) if feature_images else None
+        second_from_first = invert_rigid(extrinsics[j]) @ extrinsics[i]
+        depths += triangulated_depths(features[i], features[j], K[i], K[j], second_from_first, matches)
     depth = np.concatenate(depths)  # two depths for each point
     found = depth_bounds(depth)
     return found and DepthRange(*found, f"{len(depth) // 2} points matched between the images")
 
 
-def _inside(feature_image: FeatureImage, intrinsics: np.ndarray) -> Features:
-    """The features inside the network's crop of the image, which has these normalised intrinsics [3, 3]."""
-    features = feature_image.features
-    points = normalize_points(features.keypoints, feature_image.camera.K)
-    position = points * np.diag(intrinsics)[:2] + intrinsics[:2, 2]  # in the crop, in [0, 1]
-    inside = ((position >= 0) & (position <= 1)).all(axis=1)
-    return Features(features.keypoints[inside], features.descriptors[inside])
-
-
 def triangulated_depths(
-    first: Features, second: Features, first_K: np.ndarray, second_K: np.ndarray, second_from_first: np.ndarray
+    first: Features,
+    second: Features,
+    first_K: np.ndarray,
+    second_K: np.ndarray,
+    second_from_first: np.ndarray,
+    matches: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Depths [points] in the first and in the second view of matches that are triangulated with known cameras.
 
     first_K, second_K: in pixels, [3, 3]. second_from_first: transforms points from the first camera's frame to the
-    second's, [4, 4].
+    second's, [4, 4]. matches: those of the features, index pairs [matches, 2]; found here by default.
     """
-    pairs = match_features(first, second)
+    pairs = match_features(first, second) if matches is None else matches
     a, b = (
         normalize_points(first.keypoints[pairs[:, 0]], first_K),
         normalize_points(second.keypoints[pairs[:, 1]], second_K),
