@@ -1,8 +1,11 @@
-"""Baselines: distances between camera positions."""
+"""Baselines: distances between camera positions, and cameras that coincide."""
 
 import numpy as np
 
 ROWS_AT_ONCE = 64  # positions whose distances to all others are computed together, to bound the memory
+SAME_POSITION = 1e-4  # relative to the longest baseline
+SAME_ROTATION = 1e-4  # largest difference between the elements of two rotation matrices
+ROUNDING_STEPS = 4  # of the poses' floating-point type, at the largest coordinate
 
 
 def pairwise_baselines(extrinsics: np.ndarray) -> np.ndarray:
@@ -43,3 +46,19 @@ def longest_baseline(positions: np.ndarray) -> float:
         apart = positions[start : start + ROWS_AT_ONCE, None] - positions[None]
         longest = max(longest, float(np.einsum("ijk,ijk->ij", apart, apart).max()))
     return float(np.sqrt(longest))
+
+
+def position_rounding(extrinsics: np.ndarray) -> float:
+    """The distance within which positions are equal but for rounding; for poses [cameras, 4, 4], in their unit."""
+    return ROUNDING_STEPS * float(np.finfo(extrinsics.dtype).eps * np.abs(extrinsics[:, :3, 3]).max())
+
+
+def coinciding_poses(extrinsics: np.ndarray) -> list[tuple[int, int]]:
+    """Pairs (i, j), i < j, of poses [cameras, 4, 4] with the same position and rotation, up to rounding."""
+    baselines, rotations = pairwise_baselines(extrinsics), extrinsics[:, :3, :3]
+    apart = max(SAME_POSITION * baselines.max(), position_rounding(extrinsics))
+    found = []
+    for i in range(len(extrinsics)):
+        same = (np.abs(rotations - rotations[i]).max(axis=(1, 2)) <= SAME_ROTATION) & (baselines[i] <= apart)
+        found += [(i, j) for j in np.flatnonzero(same).tolist() if i < j]
+    return found

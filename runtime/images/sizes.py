@@ -6,6 +6,7 @@ from ..errors import InputError
 from ..system.limits import SIDE_PIXELS, parse_whole_number
 
 MAX_EXTRA_AREA = 1.3  # by which the pixels of a whole frame may exceed those asked for
+AREA_WEIGHT = 0.5  # of the logarithm of the area against that of the aspect ratio
 SEARCHED = 8  # further multiples to try for its height
 SHOWN = 40  # characters of an option that a message repeats
 
@@ -32,14 +33,15 @@ def is_valid_size(height: int, width: int, multiple: int) -> bool:
 def whole_frame_size(aspect: float, area: int, multiple: int) -> tuple[int, int]:
     """Height and width, multiples of `multiple`, of the aspect ratio (height / width) and of `area` pixels or more.
 
-    Of the sizes with at most MAX_EXTRA_AREA times the area, the one whose aspect ratio is nearest.
+    Of the sizes with at most MAX_EXTRA_AREA times the area, one whose aspect ratio is near with few more pixels.
     """
     candidates = []
     for rows in range(2, round((area * aspect) ** 0.5 / multiple) + SEARCHED):
         height = rows * multiple
         least = max(2, ceil(area / height / multiple))
         for width in (multiple * least, multiple * (least + 1)):
-            candidates.append((abs(log(height / width / aspect)), height * width, height, width))
+            cost = abs(log(height / width / aspect)) + AREA_WEIGHT * log(height * width / area)
+            candidates.append((cost, height * width, height, width))
     fitting = [found for found in candidates if found[1] <= MAX_EXTRA_AREA * area] or candidates
     return min(fitting)[2:]
 

@@ -102,9 +102,18 @@ def read_inputs(request: Request, model: ModelFiles) -> Inputs:
         count = min(posed.wanted or len(pairs), len(pairs))
         model.check_size(max(count, MIN_VIEWS), height, width)
         with working("choosing and reading images"):
-            skip = request.select is None
-            views = build_view_batch(pairs, count, height, width, skip_damaged=skip, copy_side=request.copy_side)
-    notes += [f"{line}; left out" for line in views.skipped]
+            # Estimated cameras have been checked against the same matches.
+            views = build_view_batch(
+                pairs,
+                count,
+                height,
+                width,
+                skip_damaged=request.select is None,
+                check_images=True,
+                check_cameras=posed.source != ESTIMATE,
+                copy_side=request.copy_side,
+            )
+    notes += [f"{line}; left out" for line in views.skipped] + [f"warning: {line}" for line in views.warnings]
     if isinstance(request.views, int) and request.views > len(pairs):
         notes.append(f"--views {request.views}: all {len(pairs)} images used; there are no more with a camera")
     notes += _describe_crops(views, height, width, request.crop or request.size is not None)

@@ -40,8 +40,8 @@ def extract_features(image: np.ndarray, max_features: int = MAX_FEATURES) -> Fea
     return Features(keypoints, np.sqrt(normalized).astype(np.float32))
 
 
-def match_features(first: Features, second: Features) -> np.ndarray:
-    """Index pairs [matches, 2] of mutual nearest neighbours that pass the ratio test."""
+def match_features(first: Features, second: Features, max_ratio: float = MAX_RATIO) -> np.ndarray:
+    """Index pairs [matches, 2] of mutual nearest neighbours that pass the ratio test; 1 passes all but ties."""
     if min(len(first.keypoints), len(second.keypoints)) < 2:
         return np.zeros((0, 2), int)
     # Descriptors have length 1, so 1 - similarity is half the squared distance.
@@ -51,7 +51,7 @@ def match_features(first: Features, second: Features) -> np.ndarray:
     best = similarity[rows, forward]
     similarity[rows, forward] = -1
     next_best = similarity.max(axis=1)
-    good = (backward[forward] == rows) & (1 - best < MAX_RATIO**2 * (1 - next_best))
+    good = (backward[forward] == rows) & (1 - best < max_ratio**2 * (1 - next_best))
     return np.stack([rows, forward], axis=1)[good]
 
 

@@ -3,7 +3,7 @@
 import logging
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -13,11 +13,12 @@ import numpy as np
 from ..cameras.camera import Camera
 from ..cameras.undistortion import UndistortedImage
 from ..errors import InputError, error_context
-from ..geometry.baselines import nearest_neighbor_pairs, pairwise_baselines
+from ..geometry.baselines import coinciding_poses, nearest_neighbor_pairs, pairwise_baselines, position_rounding
 from ..geometry.intrinsics import check_intrinsics
 from ..geometry.rigid import check_rigid
 from ..images.finding import image_stem
 from ..images.header import DamagedImage
+from .checks import Defect, find_defects
 from .depth_range import scene_depths
 from .loader import FeatureImage, ImageCameraPair, ViewLoader
 from .matching import ViewMatcher
@@ -27,9 +28,6 @@ LOG = logging.getLogger(__name__)
 
 EXAMPLES = 3  # names listed in a message
 
-SAME_POSITION = 1e-4  # relative to the longest baseline
-SAME_ROTATION = 1e-4  # largest difference between the elements of two rotation matrices
-ROUNDING_STEPS = 4  # of the poses' floating-point type, at the largest coordinate
 RANGE_TOLERANCE = 1e-3  # by which resampling may exceed [0, 1]
 
 
@@ -45,7 +43,8 @@ class ViewBatch:
     selection_reason: why these views were selected, for the user; empty if all are used.
     offset: subtracted from the input's world coordinates, float64 [3]; see `world_offset`.
     feature_images: the images for feature extraction, [views]; empty where every camera has a depth range.
-    skipped: a line for each image that could not be read and was left out.
+    skipped: a line for each image that was left out, which could not be read or has a defect.
+    warnings: a line for each defect of an image that is used.
     copies: of the images for refinement, [views]; empty if not asked for.
     """
 
@@ -58,6 +57,7 @@ class ViewBatch:
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
     feature_images: Sequence[FeatureImage] = ()
     skipped: Sequence[str] = ()
+    warnings: Sequence[str] = ()
     copies: Sequence[UndistortedImage] = ()
 
     @cached_property
@@ -104,44 +104,73 @@ def build_view_batch(
     height: int,
     width: int,
     skip_damaged: bool = False,
+    check_images: bool = False,
+    check_cameras: bool = False,
     copy_side: int = 0,
 ) -> ViewBatch:
     """Load views, undistorted and resized to height x width.
 
     pairs: images, as files or uint8 RGB [h, w, 3], with their cameras. Each image that is needed is read once.
     count: select this many views; all by default.
-    skip_damaged: leave out images that cannot be read, and list them in `ViewBatch.skipped`.
+    skip_damaged: leave out images that cannot be read or have a defect, and list them in `ViewBatch.skipped`.
+    check_images: look for defects of the images that are used, as `checks` describes them; check_cameras: also for
+    images that do not fit their cameras.
     copy_side: longer side of `ViewBatch.copies` in pixels; 0 for none.
     Raises InputError for fewer than two views, two cameras with the same pose, cameras without a baseline, or an image
-    that cannot be read or whose size does not match its camera.
+    that cannot be read, whose size does not match its camera, or that has a defect; blurred images only give a warning.
     """
-    loader = ViewLoader(pairs, height, width, copy_side)
+    loader = ViewLoader(pairs, height, width, match=check_cameras, copy_side=copy_side)
     usable = list(range(len(pairs)))
     skipped: list[str] = []
     while True:
         if len(usable) < MIN_VIEWS:
-            unread = f", {len(skipped)} cannot be read ({skipped[0]})" if skipped else ""
+            lost = f", {len(skipped)} cannot be used ({skipped[0]})" if skipped else ""
             image = "1 image" if len(usable) == 1 else f"{len(usable)} images"
-            raise InputError(f"{image} with a camera, expected at least {MIN_VIEWS}{unread}; add images")
+            raise InputError(f"{image} with a camera, expected at least {MIN_VIEWS}{lost}; add images")
         try:
-            return _build(loader, usable, count, skipped)
+            chosen, reason = _choose(loader, usable, count)
+            defects = find_defects(loader, chosen, usable, check_cameras) if check_images else []
+            left_out, warnings = _sort_defects(defects, len(usable), skip_damaged)
+            if not left_out:
+                return replace(_build(loader, chosen), selection_reason=reason, skipped=skipped, warnings=warnings)
+            skipped += [defect.what for defect in left_out]
+            unusable = {defect.index for defect in left_out}
         except DamagedImage as error:
-            damaged = {index for index in usable if isinstance(pairs[index][0], Path) and pairs[index][0] == error.path}
-            if not skip_damaged or not damaged:
+            unusable = {
+                index for index in usable if isinstance(pairs[index][0], Path) and pairs[index][0] == error.path
+            }
+            if not skip_damaged or not unusable:
                 raise
             skipped.append(str(error))
-            usable = [index for index in usable if index not in damaged]
+        usable = [index for index in usable if index not in unusable]
 
 
-def _build(loader: ViewLoader, usable: Sequence[int], count: int | None, skipped: Sequence[str]) -> ViewBatch:
-    """The batch of the pairs with these indices, or of `count` of them."""
-    selection_reason = ""
+def _sort_defects(defects: Sequence[Defect], usable: int, skip: bool) -> tuple[list[Defect], list[str]]:
+    """The defects whose images are to be left out, and warnings of the others.
+
+    Soft ones are no reason to have fewer than two views. Raises InputError for others, unless `skip`.
+    """
+    hard = [defect for defect in defects if not defect.soft]
+    if hard and not skip:
+        raise InputError(f"{hard[0].what}; leave it out or correct it")
+    spare = usable - len(hard) - MIN_VIEWS if skip else 0
+    soft = [defect for defect in defects if defect.soft]
+    return [*hard, *soft[: max(spare, 0)]], [defect.what for defect in soft[max(spare, 0) :]]
+
+
+def _choose(loader: ViewLoader, usable: Sequence[int], count: int | None) -> tuple[list[int], str]:
+    """The indices of the views to use, and the reason, for the user, if these are not all."""
     if count is not None and count < len(usable):
-        usable, selection_reason = _select(loader, usable, count)
-    cameras = [loader.pairs[index][1] for index in usable]
+        return _select(loader, usable, count)
+    return list(usable), ""
+
+
+def _build(loader: ViewLoader, chosen: Sequence[int]) -> ViewBatch:
+    """The batch of the pairs with these indices."""
+    cameras = [loader.pairs[index][1] for index in chosen]
     extrinsics = np.stack([camera.extrinsics for camera in cameras])  # [views, 4, 4]
     _check_distinct(extrinsics, [camera.name for camera in cameras])
-    loaded = [loader.load(index) for index in usable]
+    loaded = [loader.load(index) for index in chosen]
     feature_images = [view.feature_image for view in loaded if view.feature_image is not None]
     return ViewBatch(
         [_path(camera.name).name for camera in cameras],
@@ -149,9 +178,7 @@ def _build(loader: ViewLoader, usable: Sequence[int], count: int | None, skipped
         extrinsics,
         np.stack([view.intrinsics for view in loaded]),
         [view.camera for view in loaded],
-        selection_reason,
-        feature_images=feature_images if len(feature_images) == len(loaded) else (),
-        skipped=skipped,
+        feature_images=feature_images if loader.needs_depth else (),
         copies=[view.copy for view in loaded if view.copy is not None],
     )
 
@@ -240,19 +267,12 @@ def _examples(names: Sequence[object]) -> str:
 
 def _check_distinct(extrinsics: np.ndarray, names: Sequence[str]) -> None:
     """Raise InputError for cameras without a baseline, and for two cameras with the same pose."""
-    baselines = pairwise_baselines(extrinsics)
-    rounding = ROUNDING_STEPS * float(np.finfo(extrinsics.dtype).eps * np.abs(extrinsics[:, :3, 3]).max())
-    if baselines.max() <= rounding:
+    if pairwise_baselines(extrinsics).max() <= position_rounding(extrinsics):
         raise InputError(
             f"{names[0]} and {names[1]} are at the same position, as are all cameras; depth needs a baseline"
         )
-    rotations = extrinsics[:, :3, :3]
-    for first in range(len(extrinsics)):
-        same_rotation = np.abs(rotations - rotations[first]).max(axis=(1, 2)) <= SAME_ROTATION
-        same_position = baselines[first] <= max(SAME_POSITION * baselines.max(), rounding)
-        for second in range(first + 1, len(extrinsics)):
-            if same_rotation[second] and same_position[second]:
-                raise InputError(f"{names[first]} and {names[second]} have the same pose, expected two; leave one out")
+    for first, second in coinciding_poses(extrinsics):
+        raise InputError(f"{names[first]} and {names[second]} have the same pose, expected two; leave one out")
 
 
 # ---- arrays

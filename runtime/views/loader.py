@@ -13,29 +13,56 @@ from ..cameras.undistortion import UndistortedImage, shrink, undistort, undistor
 from ..errors import error_context
 from ..images.io import load_image
 from ..images.resizing import resize_and_crop
-from ..sfm.features import Features, extract_features
+from ..sfm.features import Features, extract_features, match_features, normalize_points
 
 ImageCameraPair = tuple[
     Path | np.ndarray, Camera
 ]  # an image, as a file or as uint8 RGB [height, width, 3], and its camera
 
 FEATURE_SIDE = 640  # pixels: longer side of the copy for feature extraction
+REDUCTION = 2  # of the copy that is looked at first where no depth is needed from its features
 
 
 class FeatureImage:
-    """A small undistorted copy of an image, and its features, which are extracted when first needed.
+    """A small undistorted copy of an image, with features and matches, which are computed when first needed.
 
-    camera: of the copy, without distortion.
+    camera: of the copy, without distortion. crop: normalised intrinsics [3, 3] of the part that the network sees; the
+    whole image by default.
     """
 
-    def __init__(self, image: np.ndarray, camera: Camera) -> None:
-        small, self.camera = undistort(*shrink(image, camera, FEATURE_SIDE))
-        self._grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+    def __init__(
+        self, image: np.ndarray, camera: Camera, crop: np.ndarray | None = None, max_side: int = FEATURE_SIDE
+    ) -> None:
+        small, self.camera = undistort(*shrink(image, camera, max_side))
+        self._grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY) if small.ndim == 3 else small
+        self._crop, self._max_side = crop, max_side
+        self._matches: dict[FeatureImage, np.ndarray] = {}
 
     @cached_property
     def features(self) -> Features:
         """SIFT features, in pixels of the copy."""
         return extract_features(self._grey)
+
+    @cached_property
+    def inside(self) -> Features:
+        """The features inside the crop."""
+        if self._crop is None:
+            return self.features
+        points = normalize_points(self.features.keypoints, self.camera.K)
+        position = points * np.diag(self._crop)[:2] + self._crop[:2, 2]  # in the crop, in [0, 1]
+        inside = ((position >= 0) & (position <= 1)).all(axis=1)
+        return Features(self.features.keypoints[inside], self.features.descriptors[inside])
+
+    @cached_property
+    def reduced(self) -> "FeatureImage":
+        """The same at a fraction of the size, and of the time for features."""
+        return FeatureImage(self._grey, self.camera, self._crop, self._max_side // REDUCTION)
+
+    def match(self, other: "FeatureImage") -> np.ndarray:
+        """Matches of the features inside both crops, as index pairs [matches, 2]."""
+        if other not in self._matches:
+            self._matches[other] = match_features(self.inside, other.inside)
+        return self._matches[other]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,13 +85,22 @@ class ViewLoader:
     """Loads views when they are first needed, and keeps them.
 
     height, width: of the network's input; images are resized by `resize_and_crop`. Feature images are made unless all
-    cameras have a depth range. copy_side: longer side of the copies for refinement, in pixels; 0 for none.
+    cameras have a depth range, or if `match` asks for them. copy_side: longer side of the copies for refinement, in
+    pixels; 0 for none.
     """
 
-    def __init__(self, pairs: Sequence[ImageCameraPair], height: int, width: int, copy_side: int = 0) -> None:
+    def __init__(
+        self, pairs: Sequence[ImageCameraPair], height: int, width: int, match: bool = False, copy_side: int = 0
+    ) -> None:
         self.pairs, self.height, self.width, self.copy_side = pairs, height, width, copy_side
-        self._with_features = any(camera.depth_range is None for _, camera in pairs)
+        self.needs_depth = any(camera.depth_range is None for _, camera in pairs)
+        self._with_features = match or self.needs_depth
         self._loaded: dict[int, LoadedView] = {}
+
+    def name(self, index: int) -> str:
+        """The file name of one of the pairs' images, or the name of its camera if it is an array."""
+        image, camera = self.pairs[index]
+        return image.name if isinstance(image, Path) else camera.name
 
     def load(self, index: int) -> LoadedView:
         """The view of one of the pairs. Raises InputError as `load_view`."""
@@ -77,7 +113,7 @@ class ViewLoader:
     def feature_image(self, index: int) -> FeatureImage:
         """The feature image of one of the pairs, if they are made. Raises InputError as `load_view`."""
         feature_image = self.load(index).feature_image
-        assert feature_image is not None, "feature images are made unless all depth ranges are known"
+        assert feature_image is not None, "feature images are made where depths or matches are needed"
         return feature_image
 
 
@@ -92,7 +128,8 @@ def load_view(
     image = given if isinstance(given, np.ndarray) else load_image(given)
     with error_context(camera.name):
         camera = resize_camera(camera, image.shape[1], image.shape[0])
-    feature_image = FeatureImage(image, camera) if with_features else None
     copy = undistorted_copy(image, camera, copy_side) if copy_side else None
-    image, camera = undistort(image, camera)
-    return LoadedView(*resize_and_crop(image, camera.K, height, width), camera, feature_image, copy)
+    undistorted, pinhole = undistort(image, camera)
+    pixels, intrinsics = resize_and_crop(undistorted, pinhole.K, height, width)
+    feature_image = FeatureImage(image, camera, intrinsics) if with_features else None
+    return LoadedView(pixels, intrinsics, pinhole, feature_image, copy)

@@ -29,13 +29,19 @@ class PointMatches:
 
 
 def match_along_epipolar_lines(
-    first: Features, second: Features, first_K: np.ndarray, second_K: np.ndarray, second_from_first: np.ndarray
+    first: Features,
+    second: Features,
+    first_K: np.ndarray,
+    second_K: np.ndarray,
+    second_from_first: np.ndarray,
+    pairs: np.ndarray | None = None,
 ) -> PointMatches:
     """Matches whose Sampson distance is below `MAX_EPIPOLAR_ERROR`.
 
-    first_K, second_K: in pixels, [3, 3]. second_from_first: as in `PointMatches`.
+    first_K, second_K: in pixels, [3, 3]. second_from_first: as in `PointMatches`. pairs: matches of the features, as
+    index pairs [matches, 2]; found here by default.
     """
-    pairs = match_features(first, second)
+    pairs = match_features(first, second) if pairs is None else pairs
     a, b = (
         normalize_points(first.keypoints[pairs[:, 0]], first_K),
         normalize_points(second.keypoints[pairs[:, 1]], second_K),
@@ -69,12 +75,14 @@ class ViewMatcher:
         if (i, j) in self._matches:
             return self._matches[i, j]
         features, K = self._features
-        first = features[i]
+        first, pairs = features[i], None
         if max_features is not None and len(first.keypoints) > max_features:
             chosen = np.linspace(0, len(first.keypoints) - 1, max_features).astype(int)
             first = Features(first.keypoints[chosen], first.descriptors[chosen])
+        elif self._feature_images:
+            pairs = self._feature_images[i].match(self._feature_images[j])
         second_from_first = invert_rigid(self.extrinsics[j]) @ self.extrinsics[i]
-        matches = match_along_epipolar_lines(first, features[j], K[i], K[j], second_from_first)
+        matches = match_along_epipolar_lines(first, features[j], K[i], K[j], second_from_first, pairs)
         if first is features[i]:
             self._matches[i, j] = matches
         return matches
@@ -83,18 +91,9 @@ class ViewMatcher:
     def _features(self) -> tuple[list[Features], np.ndarray]:
         """The features of every view, and the intrinsics [views, 3, 3] in the pixels of their keypoints."""
         if self._feature_images:
-            features = [_inside(*pair) for pair in zip(self._feature_images, self.intrinsics, strict=True)]
+            features = [feature_image.inside for feature_image in self._feature_images]
             return features, np.stack([feature_image.camera.K for feature_image in self._feature_images])
         height, width = self.images.shape[2:]
         rgb = to_uint8(self.images).transpose(0, 2, 3, 1)
         features = [extract_features(np.ascontiguousarray(image)) for image in rgb]
         return features, denormalize_intrinsics(self.intrinsics, width, height)
-
-
-def _inside(feature_image: FeatureImage, intrinsics: np.ndarray) -> Features:
-    """The features inside the network's crop of the image, which has these normalised intrinsics [3, 3]."""
-    features = feature_image.features
-    points = normalize_points(features.keypoints, feature_image.camera.K)
-    position = points * np.diag(intrinsics)[:2] + intrinsics[:2, 2]  # in the crop, in [0, 1]
-    inside = ((position >= 0) & (position <= 1)).all(axis=1)
-    return Features(features.keypoints[inside], features.descriptors[inside])

@@ -107,7 +107,7 @@ def test_an_image_is_decoded_once_and_only_if_it_is_used(capture, counted):
     assert counted["decoded"] <= VIEWS and counted["sift"] <= counted["decoded"]
     counted.clear()
     inputs = read(capture, select="0,3,5")
-    assert counted == {"decoded": 3}
+    assert counted == {"decoded": 3, "sift": 3}  # to check that the images fit their cameras
     ranged(inputs)
     assert counted == {"decoded": 3, "sift": 3}
 
@@ -135,10 +135,27 @@ def test_damaged_images_are_named_and_left_out(capture):
         read(capture, select=",".join(names))
 
 
+def test_notes_name_images_that_are_left_out_and_warn_of_those_that_were_asked_for(capture):
+    first, second = read(capture, views=2).views.names
+    paths = [capture / "images" / name for name in (first, second)]
+    cv2.imwrite(str(paths[0]), cv2.imread(str(paths[0])) // 64)
+    inputs = read(capture, views=VIEWS)
+    assert len(inputs.views.names) == VIEWS - 1 and first not in inputs.views.names
+    (line,) = [note for note in inputs.notes if note.startswith(first)]
+    assert "shows nothing" in line and line.endswith("; left out")
+    cv2.imwrite(str(paths[1]), cv2.GaussianBlur(cv2.imread(str(paths[1])), None, 4))
+    others = [path.name for path in sorted((capture / "images").iterdir()) if path.name != first]
+    inputs = read(capture, select=",".join(others))
+    assert inputs.views.names == others
+    assert any(note.startswith(f"warning: {second}: is blurred") for note in inputs.notes)
+    with pytest.raises(InputError, match=f"{first}: shows nothing.*; leave it out"):
+        read(capture, select=f"{first},{second}")
+
+
 def test_too_few_undamaged_images(capture):
     for path in sorted((capture / "images").iterdir())[1:]:
         path.write_bytes(path.read_bytes()[:60])
-    with pytest.raises(InputError, match=r"1 image with a camera, expected at least 2, 7 cannot be read \(.*damaged"):
+    with pytest.raises(InputError, match=r"1 image with a camera, expected at least 2, 7 cannot be used \(.*damaged"):
         read(capture, views=2)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from idesplat.runtime.cameras.io import read_cameras
 from idesplat.runtime.errors import InputError
-from idesplat.runtime.views import matching
+from idesplat.runtime.views import loader, matching
 from idesplat.runtime.views.batch import build_view_batch
 from idesplat.runtime.views.exposure import MAX_GAIN, compensate_exposure, solve_exposure
 from idesplat.runtime.views.exposure_mode import ExposureMode, parse_exposure_mode
@@ -201,7 +201,8 @@ def test_features_are_not_needed_in_advance(room):
 def test_pairs_are_matched_once(room, monkeypatch):
     matched = []
     match_features = matching.match_features
-    monkeypatch.setattr(matching, "match_features", lambda *given: matched.append(1) or match_features(*given))
+    for module in (loader, matching):
+        monkeypatch.setattr(module, "match_features", lambda *given: matched.append(1) or match_features(*given))
     matcher = replace(room).matcher
     first = matcher.match(0, 1)
     assert matcher.match(0, 1) is first and matcher.match(0, 1, 10) is first

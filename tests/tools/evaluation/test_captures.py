@@ -17,7 +17,7 @@ from idesplat.runtime.cameras.camera import Camera
 from idesplat.runtime.errors import InputError
 from idesplat.tools.evaluation import evaluate as library
 from idesplat.tools.evaluation.captures import capture as captures
-from idesplat.tools.evaluation.captures import checkouts
+from idesplat.tools.evaluation.captures import checkouts, spoiled
 from idesplat.tools.evaluation.captures.capture import CaptureImages, parse_view_counts, read_captures
 from idesplat.tools.evaluation.captures.checkouts import extract, fetch_checkout, find_checkout, list_folder
 from idesplat.tools.evaluation.captures.choose import as_json, camera_entries
@@ -264,6 +264,25 @@ def test_the_command_gives_the_metrics_of_the_predictor_used_by_hand(
     assert cv2.imread("out/room-3-000-003.png").shape == (64, 4 * 96 + 3 * 4, 3)
     printed = capsys.readouterr().out
     assert "mean of 1" in printed and "wrote out/results.json" in printed
+
+
+@pytest.mark.slow
+def test_bad_frames_are_found_and_good_ones_are_not(
+    capture_file: Path, repository: tuple[Path, str], capsys: Capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    document = json.loads(capture_file.read_text())
+    document["captures"].append({**document["captures"][0], "name": "same room"})  # stands for another scene
+    capture_file.write_text(json.dumps(document))
+    kinds = {kind: spoiled.SPOILED[kind] for kind in ("black", "out of focus, radius 8 pixels")}
+    monkeypatch.setattr(spoiled, "SPOILED", kinds)
+    options = ("--checkouts", repository[0].parents[1], "--capture", "room", "--frames", "3")
+    assert run_command(spoiled.main, *options) == 0
+    printed = capsys.readouterr().out
+    assert "false alarms: 0 of 5 frames beside all others, 0 of 5 in pairs alone" in printed
+    for kind in kinds:
+        (row,) = [line for line in printed.splitlines() if kind in line]
+        beside, alone, tried = (int(word) for word in row.replace(kind, "").split() if word.isdigit())
+        assert beside == alone == tried > 0
 
 
 def test_pixels_outside_the_lens_image_are_invalid(capture_file: Path, scene: Path) -> None:
