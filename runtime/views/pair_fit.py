@@ -23,6 +23,7 @@ MIN_MATCHES, MIN_EXPLAINED = 40, 0.6
 # One image saved twice: most of its matches are at the same place, also as JPEG of quality 75. Between views of one
 # scene they move by several pixels.
 SAME_PLACE, SAME_PLACE_PERCENTILE = 0.6, 80
+MIN_SAME_SIDE = 240  # pixels of the shorter side: in smaller images neighbouring views differ as little
 # Images of two scenes have inliers by chance: at most two, in a thousand pairs, and among mutual nearest neighbours,
 # which include repeated texture, up to six times the share of the image that is within the inlier error of a line. Of
 # 1200 pairs of one scene that overlap surely (see `checks`), one had as few, and its camera is wrong.
@@ -80,7 +81,7 @@ def fit_pair(first: FeatureImage, second: FeatureImage) -> PairFit:
     pixel, size = _pixel(first, second)
     errors = _epipolar_errors(*rays, second_from_first) / pixel
     inliers, error = int((errors < MAX_INLIER_ERROR).sum()), float(np.median(errors)) if len(errors) else 0.0
-    if _are_identical(rays, pixel):
+    if size >= MIN_SAME_SIDE and _are_identical(rays, pixel):
         verdict = Verdict.IDENTICAL
     elif inliers >= max(MIN_INLIERS, MIN_INLIER_RATIO * len(matches)):
         verdict = Verdict.FITS

@@ -205,8 +205,10 @@ def test_pairs_are_matched_once(room, monkeypatch):
         monkeypatch.setattr(module, "match_features", lambda *given: matched.append(1) or match_features(*given))
     matcher = replace(room).matcher
     first = matcher.match(0, 1)
+    once = len(matched)
+    assert once <= 1  # the images keep their matches, too
     assert matcher.match(0, 1) is first and matcher.match(0, 1, 10) is first
-    assert len(matched) == 1
+    assert len(matched) == once
     assert 0 < len(matcher.match(0, 2, 40).first) <= 40 < len(matcher.match(0, 2).first)
 
 
