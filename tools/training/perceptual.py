@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ...model.idesplat.efficientnet import EfficientNetLite0
+from ...model.idesplat.efficientnet import OUT_INDICES, EfficientNetLite0
 from ...runtime.errors import InputError
 from .initialization import load_imagenet_weights
 
@@ -17,8 +17,8 @@ Perceptual = Callable[[Tensor, Tensor], Tensor]
 
 # The file in which torchvision keeps VGG16's ImageNet weights, the backbone of LPIPS.
 VGG_WEIGHTS = "vgg16-397923af.pth"
-# Of EfficientNet-Lite0's feature maps, those at strides 2, 4 and 8.
-LEVELS = slice(0, 3)
+# Of EfficientNet-Lite0's feature maps, the first three are used: at strides 2, 4 and 8.
+LEVELS = 3
 
 
 def check_lpips() -> None:
@@ -59,10 +59,11 @@ class EfficientNetDistance:
         """Load the network; raises InputError if the package with its weights is not installed."""
         self.network = EfficientNetLite0().requires_grad_(False)
         load_imagenet_weights(self.network)
+        del self.network.blocks[OUT_INDICES[LEVELS - 1] + 1 :]
 
     def __call__(self, rendered: Tensor, truth: Tensor) -> Tensor:
-        """Images [n, 3, H, W] in [0, 1], sides multiples of 16 pixels -> their mean distance, a scalar."""
-        pairs = zip(self.network(rendered)[LEVELS], self.network(truth)[LEVELS], strict=True)
+        """Images [n, 3, H, W] in [0, 1], sides multiples of 8 pixels -> their mean distance, a scalar."""
+        pairs = zip(self.network(rendered), self.network(truth), strict=True)
         distances = [squared_distance(found, wanted) for found, wanted in pairs]
         return sum(distances[1:], distances[0]) / len(distances)
 
