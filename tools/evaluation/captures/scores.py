@@ -17,6 +17,8 @@ from ....runtime.splats.gaussians import Gaussians
 from ....runtime.system.progress import reporting_to
 from ....runtime.views.batch import ViewBatch
 from ....runtime.views.depth_range import DepthRange
+from ....runtime.views.exposure import compensate_exposure
+from ....runtime.views.exposure_mode import ExposureMode
 from ..baselines import best_fronto_parallel_plane, nearest_view
 from ..cases import EvalCase, PosedImages
 from ..metrics import PerceptualMetric, fit_exposure, psnr, ssim
@@ -141,6 +143,7 @@ class CaptureEvaluator:
         views, span = _view_batch(case.context), DepthRange(case.near, case.far, "given")
         started = time.perf_counter()
         with reporting_to(None):
+            views, _ = compensate_exposure(views, ExposureMode.AUTO)
             prediction = predict_views(self.predictor, views, span)
             prediction = fuse(prediction, views, span, self.plan.filters).prediction
             if self.plan.copy_side:
