@@ -93,14 +93,28 @@ def _value(node: Any) -> Any:
     if node.isString():
         return node.string()
     if node.isMap():
-        matrix = node.mat()
-        return None if matrix is None else np.asarray(matrix, np.float64)
-    if node.isSeq():
-        items = [node.at(index) for index in range(node.size())]
-        return (
-            np.array([item.real() for item in items]) if all(item.isReal() or item.isInt() for item in items) else None
-        )
-    return None
+        return _stored_matrix(node)
+    return _numbers(node)
+
+
+def _stored_matrix(node: Any) -> np.ndarray | None:
+    """A matrix of cv2.FileStorage, float64 [rows, cols]; None for anything else.
+
+    `node.mat()` would write past its memory where rows and cols do not fit the data.
+    """
+    rows, cols, values = node.getNode("rows"), node.getNode("cols"), _numbers(node.getNode("data"))
+    if values is None or not (rows.isInt() and cols.isInt()):
+        return None
+    shape = int(rows.real()), int(cols.real())
+    return values.reshape(shape) if min(shape) > 0 and shape[0] * shape[1] == values.size else None
+
+
+def _numbers(node: Any) -> np.ndarray | None:
+    """A sequence of numbers, float64; None for anything else."""
+    if not node.isSeq():
+        return None
+    items = [node.at(index) for index in range(node.size())]
+    return np.array([item.real() for item in items]) if all(item.isReal() or item.isInt() for item in items) else None
 
 
 def _matrix(fields: dict[str, Any], names: Sequence[str], shape: tuple[int, ...] | None = None) -> np.ndarray:

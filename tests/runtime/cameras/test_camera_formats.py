@@ -275,6 +275,18 @@ def test_stereo_calibration(tmp_path, suffix, size):
         read_cameras(path, paths[:1])
 
 
+@pytest.mark.parametrize("size", ["rows: 99999999", "cols: -1", "cols: 4", "rows: 0", "rows: 3.5", "rows: x"])
+def test_a_stereo_matrix_whose_size_does_not_fit_its_data_is_refused(size, tmp_path):
+    """cv2.FileNode.mat() corrupts the memory of the process for these."""
+    path = tmp_path / "stereo.yml"
+    write_stereo(path, size="numbers")
+    good, name = path.read_text(), size.partition(":")[0]
+    before, after = good.split(f"{name}: 3", 1)
+    path.write_text(before + size + after)
+    with pytest.raises(InputError, match="expected a matrix"):
+        read_cameras(path, [])
+
+
 @pytest.mark.parametrize("names", [("K{}", "D{}", "R", "T"), ("cameraMatrix{}", "distCoeffs{}", "R", "T")])
 def test_stereo_calibration_by_other_names(tmp_path, names):
     write_stereo(tmp_path / "s.yml", names, "numbers", rotation=cv2.Rodrigues(STEREO[:3, :3])[0])
