@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 
 from ..geometry.intrinsics import crop_intrinsics, normalize_intrinsics, scale_intrinsics
-
-MAX_STRETCH = 1.15
+from .sizes import MAX_STRETCH
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,10 @@ from math import ceil, log
 from ..errors import InputError
 from ..system.limits import SIDE_PIXELS, parse_whole_number
 
-MAX_EXTRA_AREA = 1.3  # by which the pixels of a whole frame may exceed those asked for
+MAX_EXTRA_AREA = 1.3  # by which the pixels of a whole frame may exceed those asked for, where there is a choice
 AREA_WEIGHT = 0.5  # of the logarithm of the area against that of the aspect ratio
-SEARCHED = 8  # further multiples to try for its height
+MAX_STRETCH = 1.15  # of one axis against the other, by which a whole frame may be resized rather than cropped
+SEARCHED = 8  # multiples to try for its width, and beyond the exact one for its height
 SHOWN = 40  # characters of an option that a message repeats
 
 
@@ -33,17 +34,19 @@ def is_valid_size(height: int, width: int, multiple: int) -> bool:
 def whole_frame_size(aspect: float, area: int, multiple: int) -> tuple[int, int]:
     """Height and width, multiples of `multiple`, of the aspect ratio (height / width) and of `area` pixels or more.
 
-    Of the sizes with at most MAX_EXTRA_AREA times the area, one whose aspect ratio is near with few more pixels.
+    Its aspect ratio is near, within MAX_STRETCH, so that nothing is cropped, and its pixels are few more: at most
+    MAX_EXTRA_AREA times the area, but for long frames of few multiples.
     """
     candidates = []
     for rows in range(2, round((area * aspect) ** 0.5 / multiple) + SEARCHED):
         height = rows * multiple
         least = max(2, ceil(area / height / multiple))
-        for width in (multiple * least, multiple * (least + 1)):
-            cost = abs(log(height / width / aspect)) + AREA_WEIGHT * log(height * width / area)
-            candidates.append((cost, height * width, height, width))
-    fitting = [found for found in candidates if found[1] <= MAX_EXTRA_AREA * area] or candidates
-    return min(fitting)[2:]
+        for width in range(multiple * least, multiple * (least + SEARCHED), multiple):
+            stretch = abs(log(height / width / aspect))
+            cost = stretch + AREA_WEIGHT * log(height * width / area)
+            cropped, large = stretch > log(MAX_STRETCH), height * width > MAX_EXTRA_AREA * area
+            candidates.append((cropped, large, cost, height, width))
+    return min(candidates)[3:]
 
 
 def describe_size_rule(multiple: int) -> str:

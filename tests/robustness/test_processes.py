@@ -155,7 +155,7 @@ def test_nothing_but_our_cache_is_left_behind(scene, tmp_path):
     environment |= {"HOME": str(home), "TMPDIR": str(temporary)}
     given = ("--images", scene / "images", "--cameras", scene / "transforms.json")
     options = {"env": environment, "cwd": work}
-    made = call("idesplat.runtime.cli.infer", *given, "--out", "scene.ply", **options)
+    made = call("idesplat.runtime.cli.infer", *given, "--quality", "fast", "--out", "scene.ply", **options)
     assert made.returncode == 0, made.stderr
     assert {str(path.relative_to(home)) for path in home.glob("*/*")} == {".cache/idesplat"}
     assert not list(temporary.iterdir())
