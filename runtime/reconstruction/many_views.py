@@ -15,8 +15,9 @@ from ..views.groups import group_views, nearest_views
 # Pixels of all views that the network gets together: about 2 GB of memory with the bundled model.
 GROUP_PIXELS = 600_000
 MIN_GROUP = 3  # views
-# Views that vote on a view's points. More cost time, and see less of the same.
-VOTERS = 8
+# Views that vote on a view's points. Half of them see most of the same; the others look from other sides, where a wrong
+# depth shows that neighbours agree on because nothing in their images speaks against it.
+VOTERS = 24
 
 
 def predict_views(predictor: Predictor, views: ViewBatch, span: DepthRange) -> Prediction:
@@ -44,8 +45,14 @@ def predict_views(predictor: Predictor, views: ViewBatch, span: DepthRange) -> P
 
 
 def voting_views(views: ViewBatch, span: DepthRange) -> list[np.ndarray]:
-    """For each view, the others that see most of the same, as indices."""
-    return nearest_views(views.cameras, _middle_depths(views, span), VOTERS)
+    """For each view, the others that see most of the same and some from other sides, as indices."""
+    others = len(views.names) - 1
+    ranked = nearest_views(views.cameras, _middle_depths(views, span), others)
+    if others <= VOTERS:
+        return ranked
+    far = np.linspace(VOTERS // 2, others - 1, VOTERS - VOTERS // 2).astype(int)
+    chosen = np.concatenate([np.arange(VOTERS // 2), far])
+    return [order[chosen] for order in ranked]
 
 
 def _middle_depths(views: ViewBatch, span: DepthRange) -> np.ndarray:

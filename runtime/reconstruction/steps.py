@@ -70,7 +70,7 @@ def make_plan(
     default = Quality.STANDARD if model.path == bundled_model() else Quality.FAST
     preset = PRESETS[Quality(quality or default)]
     if preset.fuse and model.metadata.gaussians:
-        filters = replace(filters, remove_contradicted=True)
+        filters = replace(filters, remove_contradicted=True, remove_redundant=True)
     limit = parse_refine(refine) if refine is not None else None
     return Plan(preset, filters, limit, max_gaussians, model.metadata.gaussians)
 
@@ -87,6 +87,7 @@ def fuse(prediction: Prediction, views: ViewBatch, span: DepthRange, filters: Fi
         views.intrinsics,
         filters,
         voting_views(views, span),
+        views.images,
     )
     notes = [describe_removed(removed, len(kept))] if any(removed.values()) else []
     return Stepped(replace(prediction, gaussians=kept), removed, {"fuse": time.perf_counter() - started}, notes)

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..geometry.consistency import depth_jumps, multi_view_consistency
-from .fusion import MIN_VOTING_VIEWS, find_contradicted
+from .fusion import MIN_VOTING_VIEWS, Surfaces, find_contradicted, find_redundant
 from .gaussians import Gaussians
 from .merging import find_duplicates, merge_gaussians
 
@@ -27,6 +27,7 @@ class FilterOptions:
         `geometry.consistency.multi_view_consistency`.
     remove_contradicted: those that other views see through, with three views or more; see `fusion.find_contradicted`.
     merge_duplicates: merge Gaussians that different views predict at the same point of a surface into one.
+    remove_redundant: those of surfaces that two other views show; see `fusion.find_redundant`.
 
     Raises InputError if a value is out of range.
     """
@@ -37,6 +38,7 @@ class FilterOptions:
     min_consistency: float = 0.0
     remove_contradicted: bool = False
     merge_duplicates: bool = False
+    remove_redundant: bool = False
 
     def __post_init__(self) -> None:
         for name in ("min_opacity", "min_consistency"):
@@ -62,15 +64,18 @@ def filter_gaussians(
     intrinsics: np.ndarray,
     options: FilterOptions,
     voters: list[np.ndarray] | None = None,
+    images: np.ndarray | None = None,
 ) -> tuple[Gaussians, dict[str, int]]:
     """The Gaussians that the filters keep, and how many each filter removed, by its name.
 
     gaussians: one for each pixel, ordered by view, row, column. depth: z-depth, [views, height, width]. extrinsics:
     camera-to-world, OpenCV axes, [views, 4, 4]. intrinsics: normalised by width and height, [views, 3, 3]. voters: the
-    views that may contradict each view, as arrays of indices; by default all others.
+    views that may contradict each view, as arrays of indices; by default all others. images: RGB in [0, 1], [views, 3,
+    height, width], for votes by colour.
     Raises InputError if a border is wider than the images, or no Gaussian is left.
     """
     means = gaussians.means.reshape(*depth.shape, 3)
+    surfaces = Surfaces(means, depth, extrinsics, intrinsics, images, voters)
     kept, removed = np.ones(depth.shape, bool), {}
     for name in options.enabled:
         before = int(kept.sum())
@@ -85,11 +90,13 @@ def filter_gaussians(
                 kept &= multi_view_consistency(means, depth, extrinsics, intrinsics) >= options.min_consistency
             case "remove_contradicted":
                 if len(depth) >= MIN_VOTING_VIEWS:
-                    kept &= ~find_contradicted(means, depth, extrinsics, intrinsics, voters)
+                    kept &= ~find_contradicted(surfaces)
             case "merge_duplicates":
                 representative = find_duplicates(means, depth, kept, extrinsics, intrinsics)
                 gaussians = merge_gaussians(gaussians, representative)
                 kept &= representative == np.arange(kept.size).reshape(kept.shape)
+            case "remove_redundant":
+                kept &= ~find_redundant(surfaces, kept)
         removed[name] = before - int(kept.sum())
     if not kept.any():
         raise InputError(f"{', '.join(map(_option, removed))}: no Gaussian is left of {kept.size}; filter less")
@@ -105,6 +112,7 @@ def describe_removed(removed: dict[str, int], left: int) -> str:
         "min_consistency": "not confirmed by other views",
         "remove_contradicted": "that other views see through",
         "merge_duplicates": "merged into another view's",
+        "remove_redundant": "that two other views show as well",
     }
     counts = ", ".join(f"{count:,} {words[name]}" for name, count in removed.items())
     return f"filtered: {counts}; {left:,} Gaussians left"

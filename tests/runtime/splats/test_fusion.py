@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from idesplat.runtime.geometry.intrinsics import denormalize_intrinsics
-from idesplat.runtime.splats.fusion import find_contradicted
+from idesplat.runtime.splats.fusion import Surfaces, find_contradicted, find_redundant
 
 HEIGHT, WIDTH = 24, 32
 WALL = 4.0
@@ -26,8 +26,12 @@ def unproject(depth: np.ndarray, extrinsics: np.ndarray) -> np.ndarray:
 
 
 def contradicted(depth: np.ndarray) -> np.ndarray:
+    return find_contradicted(surfaces(depth))
+
+
+def surfaces(depth: np.ndarray, images: np.ndarray | None = None) -> Surfaces:
     extrinsics = cameras(len(depth))
-    return find_contradicted(unproject(depth, extrinsics), depth, extrinsics, np.tile(K, (len(depth), 1, 1)))
+    return Surfaces(unproject(depth, extrinsics), depth, extrinsics, np.tile(K, (len(depth), 1, 1)), images)
 
 
 def wall(views: int) -> np.ndarray:
@@ -67,3 +71,49 @@ def test_what_only_one_view_sees_stays() -> None:
     found = contradicted(depth)
     assert not found[0, :, :3].any()
     assert not found[2][PATCH].any()
+
+
+def test_a_point_of_another_colour_than_the_surface_at_its_place_goes() -> None:
+    """Pixels beside an edge that got the depth of the surface behind it: all depths agree, the colours do not."""
+    depth = wall(4)
+    images = np.full((4, 3, HEIGHT, WIDTH), 0.3, np.float32)
+    images[1, :, PATCH[0], PATCH[1]] = 0.9
+    found = find_contradicted(surfaces(depth, images))
+    assert found[1][PATCH].mean() > 0.9
+    found[1][PATCH] = False
+    assert not found.any()
+
+
+def test_colours_within_fine_texture_agree() -> None:
+    """Each view samples stripes of one pixel elsewhere."""
+    images = np.full((4, 3, HEIGHT, WIDTH), 0.1, np.float32)
+    images[..., ::2] = 0.9
+    assert not find_contradicted(surfaces(wall(4), images)).any()
+
+
+def test_two_views_of_a_surface_stay_and_of_the_others_what_these_do_not_see() -> None:
+    depth = wall(4)
+    everything = np.ones(depth.shape, bool)
+    redundant = find_redundant(surfaces(depth), everything)
+    assert not redundant[:2].any()
+    shift = 0.3 * WIDTH * float(K[0, 0]) / WALL  # pixels from view to view
+    inside = slice(1, int(WIDTH - 3 * shift) - 1)
+    assert redundant[2:, :, inside].all()
+    assert not redundant[3, :, WIDTH - int(shift) :].any()
+
+
+def test_what_is_removed_counts_as_no_copy() -> None:
+    kept = np.ones((4, HEIGHT, WIDTH), bool)
+    kept[0] = False
+    redundant = find_redundant(surfaces(wall(4)), kept)
+    assert not redundant[:3].any() and redundant[3].any()
+
+
+def test_a_nearer_view_of_a_surface_stays() -> None:
+    """It samples the surface more finely than those that stand farther away."""
+    extrinsics = cameras(3) * 1.0
+    extrinsics[:2, 2, 3] = -WALL
+    depth = wall(3)
+    depth[:2] = 2 * WALL
+    found = Surfaces(unproject(depth, extrinsics), depth, extrinsics, np.tile(K, (3, 1, 1)))
+    assert not find_redundant(found, np.ones(depth.shape, bool)).any()
