@@ -67,9 +67,9 @@ class Surfaces:
             return nothing, nothing, nothing
         colors = np.ascontiguousarray((np.clip(self.images, 0, 1) * 255).astype(np.uint8).transpose(0, 2, 3, 1))
         window = np.ones((COLOR_WINDOW, COLOR_WINDOW), np.uint8)
-        tolerance = (round(255 * COLOR_TOLERANCE),) * 3
-        least = np.stack([cv2.subtract(cv2.erode(image, window), (*tolerance, 0)) for image in colors])
-        most = np.stack([cv2.add(cv2.dilate(image, window), (*tolerance, 0)) for image in colors])
+        tolerance = round(255 * COLOR_TOLERANCE)
+        least = np.stack([np.maximum(cv2.erode(image, window), tolerance) - tolerance for image in colors])
+        most = np.stack([np.minimum(cv2.dilate(image, window), 255 - tolerance) + tolerance for image in colors])
         return colors, least, most
 
 
