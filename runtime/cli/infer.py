@@ -148,6 +148,15 @@ def infer(
             rich_help_panel=FILTERS,
         ),
     ] = False,
+    close_holes: Annotated[
+        bool,
+        typer.Option(
+            "--close-holes",
+            help="Fit the Gaussians' shapes to the surface, and let the background go on behind edges (--quality "
+            "standard and high do).",
+            rich_help_panel=FILTERS,
+        ),
+    ] = False,
     save_cameras: Annotated[
         Path | None,
         typer.Option(
@@ -187,7 +196,13 @@ def infer(
     model = model or bundled_model()
     targets.announce(model)
     filters = FilterOptions(
-        min_opacity, crop_border, max_depth_jump, min_consistency, remove_contradicted, merge_duplicates
+        min_opacity=min_opacity,
+        crop_border=crop_border,
+        max_depth_jump=max_depth_jump,
+        min_consistency=min_consistency,
+        remove_contradicted=remove_contradicted,
+        merge_duplicates=merge_duplicates,
+        close_holes=close_holes,
     )
     files = read_model(model)
     targets.check_model(files, filters)

@@ -54,7 +54,7 @@ def refine(
 
     Ctrl-C ends the refinement and writes what it has reached.
     """
-    from ..refinement.options import options_for
+    from ..refinement.options import RefinementOptions
     from ..refinement.refine import refine as fit
     from ..splats.io import read_offset, read_splats, splat_suffix, write_splats
     from ..system.files import scratch_folder
@@ -68,7 +68,7 @@ def refine(
     gaussians, offset = read_splats(scene), read_offset(scene)
     with scratch_folder() as folder:
         views = _read_views(cameras, camera_format, images or [], offset, max_side, folder)
-    options = options_for(len(views), steps or STEPS_PER_VIEW * len(views), seed=seed, max_gaussians=max_gaussians)
+    options = RefinementOptions(steps or STEPS_PER_VIEW * len(views), seed=seed, max_gaussians=max_gaussians)
     with StopOnInterrupt() as on_step:
         refined = fit(gaussians, views, options, on_step)
     if on_step.stopped:

@@ -25,7 +25,8 @@ class Preset:
     """A trade of time for quality.
 
     views: how many images are used where neither --views nor --select says it. pixels: least area of the images that
-    the network gets; that of its training if larger. fuse: whether Gaussians that other views see through are removed.
+    the network gets; that of its training if larger. fuse: whether Gaussians that other views see through and surplus
+    copies of a surface are removed, and holes closed.
     steps_per_view, seconds: of the refinement, whichever ends first; no steps for none. copy_side: longer side of the
     images that it fits, in pixels.
     """

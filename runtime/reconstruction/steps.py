@@ -10,7 +10,7 @@ from ..errors import InputError
 from ..inference.bundled_model import bundled_model
 from ..inference.model_files import ModelFiles
 from ..inference.predictor import Prediction
-from ..refinement.options import RefinementOptions, options_for
+from ..refinement.options import RefinementOptions, prediction_options
 from ..refinement.refine import refine
 from ..refinement.views import posed_image
 from ..splats.filtering import FilterOptions, describe_removed, filter_gaussians
@@ -42,7 +42,7 @@ class Plan:
     def refinement(self, views: int) -> RefinementOptions:
         """The options of the refinement on so many views."""
         limit = self.limit or RefinementLimit(views * self.preset.steps_per_view, self.preset.seconds)
-        return options_for(views, steps=limit.steps, seconds=limit.seconds, max_gaussians=self.max_gaussians)
+        return prediction_options(views, steps=limit.steps, seconds=limit.seconds, max_gaussians=self.max_gaussians)
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def make_plan(
     default = Quality.STANDARD if model.path == bundled_model() else Quality.FAST
     preset = PRESETS[Quality(quality or default)]
     if preset.fuse and model.metadata.gaussians:
-        filters = replace(filters, remove_contradicted=True, remove_redundant=True)
+        filters = replace(filters, remove_contradicted=True, remove_redundant=True, close_holes=True)
     limit = parse_refine(refine) if refine is not None else None
     return Plan(preset, filters, limit, max_gaussians, model.metadata.gaussians)
 

@@ -3,11 +3,12 @@
 from dataclasses import dataclass
 from typing import Any
 
-# Measured on held-out views of real captures (docs/reconstruction.md): the network's Gaussians are small and opaque, so
-# that a layer that is nearer by a hair hides the others; larger ones that let light through have gradients and average.
+# How the Gaussians of a feed-forward prediction start, measured on held-out views of real captures
+# (docs/reconstruction.md). The network's are small and opaque, so that a layer that is nearer by a hair hides the
+# others; larger ones that let light through have gradients and average.
 FEW_VIEWS = 2
 FEW_VIEWS_OPACITY, FEW_VIEWS_SCALE = 0.9, 2.0
-MANY_VIEWS_OPACITY, MANY_VIEWS_SCALE = 0.7, 1.5
+MANY_VIEWS_OPACITY, MANY_VIEWS_SCALE = 0.7, 1.8
 
 
 @dataclass(frozen=True)
@@ -26,23 +27,23 @@ class RefinementOptions:
     seconds: float = float("inf")
     seed: int = 0
     max_gaussians: int = 0
-    max_opacity: float = 0.8
-    scale_factor: float = 1.1
+    max_opacity: float = 0.99
+    scale_factor: float = 1.0
     ssim_weight: float = 0.2
-    lr_means: float = 2e-4
-    lr_scales: float = 1e-2
-    lr_quats: float = 2e-3
-    lr_opacities: float = 5e-2
-    lr_dc: float = 5e-3
-    lr_sh: float = 1e-3
+    lr_means: float = 1.2e-3
+    lr_scales: float = 6e-2
+    lr_quats: float = 1.2e-2
+    lr_opacities: float = 0.3
+    lr_dc: float = 3e-2
+    lr_sh: float = 6e-3
     lr_exposure: float = 1e-3
     final_lr: float = 0.1
 
 
-def options_for(views: int, steps: int, **options: Any) -> RefinementOptions:
-    """The options for so many views; without steps, a scene is left as it is but for what `max_gaussians` removes."""
+def prediction_options(views: int, steps: int, **options: Any) -> RefinementOptions:
+    """The options for a prediction of so many views; without steps, it is left as it is but for `max_gaussians`."""
     if not steps:
-        return RefinementOptions(steps=0, max_opacity=1, scale_factor=1, **options)
+        return RefinementOptions(steps=0, max_opacity=1, **options)
     if views <= FEW_VIEWS:
         return RefinementOptions(steps=steps, max_opacity=FEW_VIEWS_OPACITY, scale_factor=FEW_VIEWS_SCALE, **options)
     return RefinementOptions(steps=steps, max_opacity=MANY_VIEWS_OPACITY, scale_factor=MANY_VIEWS_SCALE, **options)

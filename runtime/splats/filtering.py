@@ -1,4 +1,4 @@
-"""Optional filters: opacity threshold, border crop, depth discontinuities, multi-view consistency, duplicate merging.
+"""Optional filters: opacity threshold, border crop, depth discontinuities, consistency, duplicates, holes.
 
 A prediction has one Gaussian for each pixel of each view, so the filters can use the depth maps and the other views.
 They run in the order of the fields of `FilterOptions`, each on what the ones before it kept.
@@ -10,14 +10,16 @@ import numpy as np
 
 from ..errors import InputError
 from ..geometry.consistency import depth_jumps, multi_view_consistency
-from .fusion import MIN_VOTING_VIEWS, Surfaces, find_contradicted, find_redundant
+from .fusion import MIN_VOTING_VIEWS, find_contradicted, find_redundant
 from .gaussians import Gaussians
+from .holes import close_holes
 from .merging import find_duplicates, merge_gaussians
+from .surfaces import Surfaces
 
 
 @dataclass(frozen=True)
 class FilterOptions:
-    """Which Gaussians to remove; none by default.
+    """Which Gaussians to remove or change; none by default.
 
     min_opacity: those with a lower opacity, 0 to 1.
     crop_border: those of so many pixels along the edges of every image, where networks have the least context.
@@ -28,6 +30,7 @@ class FilterOptions:
     remove_contradicted: those that other views see through, with three views or more; see `fusion.find_contradicted`.
     merge_duplicates: merge Gaussians that different views predict at the same point of a surface into one.
     remove_redundant: those of surfaces that two other views show; see `fusion.find_redundant`.
+    close_holes: fit shapes to the surface, and continue background behind depth edges; see `holes.close_holes`.
 
     Raises InputError if a value is out of range.
     """
@@ -39,6 +42,7 @@ class FilterOptions:
     remove_contradicted: bool = False
     merge_duplicates: bool = False
     remove_redundant: bool = False
+    close_holes: bool = False
 
     def __post_init__(self) -> None:
         for name in ("min_opacity", "min_consistency"):
@@ -68,10 +72,12 @@ def filter_gaussians(
 ) -> tuple[Gaussians, dict[str, int]]:
     """The Gaussians that the filters keep, and how many each filter removed, by its name.
 
+    With `close_holes`, those that it adds stand after those that are kept.
+
     gaussians: one for each pixel, ordered by view, row, column. depth: z-depth, [views, height, width]. extrinsics:
     camera-to-world, OpenCV axes, [views, 4, 4]. intrinsics: normalised by width and height, [views, 3, 3]. voters: the
-    views that may contradict each view, as arrays of indices; by default all others. images: RGB in [0, 1], [views, 3,
-    height, width], for votes by colour.
+    views that may contradict or confirm each view, as arrays of indices; by default all others. images: RGB in [0, 1],
+    [views, 3, height, width], for votes by colour.
     Raises InputError if a border is wider than the images, or no Gaussian is left.
     """
     means = gaussians.means.reshape(*depth.shape, 3)
@@ -97,9 +103,13 @@ def filter_gaussians(
                 kept &= representative == np.arange(kept.size).reshape(kept.shape)
             case "remove_redundant":
                 kept &= ~find_redundant(surfaces, kept)
+            case "close_holes":
+                continue  # it adds some: after all others
         removed[name] = before - int(kept.sum())
     if not kept.any():
         raise InputError(f"{', '.join(map(_option, removed))}: no Gaussian is left of {kept.size}; filter less")
+    if options.close_holes:
+        return close_holes(gaussians, surfaces, kept), removed
     return gaussians.select(kept.ravel()), removed
 
 

@@ -60,8 +60,8 @@ def merge_gaussians(gaussians: Gaussians, representative: np.ndarray) -> Gaussia
 
     mean = total(weight[:, None] * gaussians.means[members])
     offset = gaussians.means[members] - mean[group]
-    covariance = _covariances(gaussians, members) + offset[:, :, None] * offset[:, None, :]
-    scales, quats = _ellipsoids(total(weight[:, None, None] * covariance))
+    covariance = covariances(gaussians, members) + offset[:, :, None] * offset[:, None, :]
+    scales, quats = ellipsoids(total(weight[:, None, None] * covariance))
     log_transmittance = total(
         np.log1p(-np.minimum(gaussians.opacities[members], MAX_OPACITY).astype(np.float64))[:, None]
     )
@@ -78,13 +78,13 @@ def merge_gaussians(gaussians: Gaussians, representative: np.ndarray) -> Gaussia
     return Gaussians(**arrays)
 
 
-def _covariances(gaussians: Gaussians, members: np.ndarray) -> np.ndarray:
+def covariances(gaussians: Gaussians, members: np.ndarray) -> np.ndarray:
     """Covariances R S S^T R^T [members, 3, 3] of some of the Gaussians."""
     axes = quaternions_to_matrices(gaussians.quats[members]) * gaussians.scales[members][:, None, :]
     return axes @ axes.swapaxes(1, 2)
 
 
-def _ellipsoids(covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def ellipsoids(covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Scales [n, 3] and quaternions wxyz [n, 4] of covariances [n, 3, 3], by eigendecomposition."""
     variances, axes = np.linalg.eigh(covariances)
     axes[:, :, 2] *= np.linalg.det(axes)[:, None]  # a rotation, not a reflection: determinant 1

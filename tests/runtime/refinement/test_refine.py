@@ -81,7 +81,8 @@ def test_no_gaussian_is_stretched_over_what_the_scene_does_not_cover(views: list
     """Half of a scene, refined on images of the whole, covers no more than before."""
     whole = scene(0)
     half = whole.select(whole.means[:, 0] < 0)
-    refined = refine(half, views, RefinementOptions(steps=60, scale_factor=1, max_opacity=1 - 1e-6)).gaussians
+    slow = RefinementOptions(steps=60, max_opacity=1 - 1e-6, lr_means=2e-4, lr_scales=1e-2)
+    refined = refine(half, views, slow).gaussians
     before, after = (render_view(each, np.eye(4), K, SIZE, SIZE).alpha for each in (half, refined))
     assert after[:, 24:].max() < 0.2 and (after > 0.5).mean() < (before > 0.5).mean() + 0.03
 
@@ -107,7 +108,7 @@ def test_the_strongest_gaussians_are_kept(views: list[PosedImage]) -> None:
     wall = replace(front, opacities=opacities, scales=scales)
     hidden = replace(front, means=front.means + np.float32([0, 0, 6]))
     both = Gaussians(*(np.concatenate([getattr(part, f.name) for part in (hidden, wall)]) for f in fields(wall)))
-    options = RefinementOptions(steps=10, max_opacity=0.99, max_gaussians=len(front))
+    options = RefinementOptions(steps=10, max_gaussians=len(front), lr_opacities=5e-2)
     refined = refine(both, views, options).gaussians
     assert 0 < len(refined) <= len(front)
     assert (refined.means[:, 2] < 6).mean() > 0.99

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 from idesplat.runtime.geometry.intrinsics import denormalize_intrinsics
-from idesplat.runtime.splats.fusion import Surfaces, find_contradicted, find_redundant
+from idesplat.runtime.splats.fusion import find_contradicted, find_redundant
+from idesplat.runtime.splats.surfaces import Surfaces
 
 HEIGHT, WIDTH = 24, 32
 WALL = 4.0

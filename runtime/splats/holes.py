@@ -1,0 +1,29 @@
+"""Closing of holes: shapes that follow the surface, and background that goes on behind depth edges."""
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from .background import continue_background
+from .gaussians import Gaussians
+from .surface_shape import fit_to_surface
+from .surfaces import Surfaces
+
+
+def close_holes(gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarray) -> Gaussians:
+    """The kept Gaussians in the shapes of `surface_shape.fit_to_surface`, then `background.continue_background`'s.
+
+    gaussians: one for each pixel, ordered by view, row, column. kept: those that filters kept, bool [views, height,
+    width].
+    """
+    views, pixels = len(kept), kept[0].size
+
+    def close(view: int) -> tuple[Gaussians, Gaussians]:
+        own = gaussians.select(np.arange(pixels * view, pixels * (view + 1)))
+        fitted = fit_to_surface(own, surfaces, kept, view)
+        return fitted.select(kept[view].ravel()), continue_background(fitted, surfaces, kept, view)
+
+    with ThreadPoolExecutor(min(views, os.cpu_count() or 1)) as pool:
+        fitted, continued = zip(*pool.map(close, range(views)), strict=True)
+    return Gaussians.concatenate([*fitted, *continued])
