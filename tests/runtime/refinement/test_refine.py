@@ -108,7 +108,7 @@ def test_the_strongest_gaussians_are_kept(views: list[PosedImage]) -> None:
     wall = replace(front, opacities=opacities, scales=scales)
     hidden = replace(front, means=front.means + np.float32([0, 0, 6]))
     both = Gaussians(*(np.concatenate([getattr(part, f.name) for part in (hidden, wall)]) for f in fields(wall)))
-    options = RefinementOptions(steps=10, max_gaussians=len(front), lr_opacities=5e-2)
+    options = RefinementOptions(steps=10, max_gaussians=len(front), lr_scales=1e-2, lr_opacities=5e-2)
     refined = refine(both, views, options).gaussians
     assert 0 < len(refined) <= len(front)
     assert (refined.means[:, 2] < 6).mean() > 0.99
