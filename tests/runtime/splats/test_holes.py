@@ -1,0 +1,139 @@
+"""Closing of holes: slanted surfaces stay closed from aside and from near, and edges have background behind them."""
+
+import numpy as np
+import pytest
+from idesplat.runtime.geometry.intrinsics import denormalize_intrinsics
+from idesplat.runtime.rendering.render import render_view
+from idesplat.runtime.splats.gaussians import Gaussians
+from idesplat.runtime.splats.holes import close_holes
+from idesplat.runtime.splats.surfaces import Surfaces
+
+SIZE = 48
+DISTANCE = 4.0
+INTRINSICS = np.array([[1.0, 0, 0.5], [0, 1.0, 0.5], [0, 0, 1]], np.float32)
+K = denormalize_intrinsics(INTRINSICS[None], SIZE, SIZE)[0]
+PIXEL_SCALE = 0.45  # standard deviation in pixels, as the bundled model predicts it
+MIDDLE = slice(12, 36)
+
+
+def rays() -> np.ndarray:
+    rows, columns = np.mgrid[:SIZE, :SIZE] + 0.5
+    return np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(K).T
+
+
+def slanted(degrees: float) -> np.ndarray:
+    """The depth of a plane through (0, 0, DISTANCE) that is turned about the y axis, [SIZE, SIZE]."""
+    tangent = np.tan(np.radians(degrees))
+    return (DISTANCE / (1 - tangent * rays()[..., 0])).astype(np.float32)
+
+
+def shifted(*positions: float) -> np.ndarray:
+    extrinsics = np.tile(np.eye(4), (len(positions), 1, 1))
+    extrinsics[:, 0, 3] = positions
+    return extrinsics
+
+
+def pixel_sized(depth: np.ndarray, extrinsics: np.ndarray) -> tuple[Gaussians, Surfaces]:
+    """A round opaque Gaussian of a pixel's size for each pixel, and the surfaces that they lie on."""
+    points = rays() * depth[..., None] + extrinsics[:, None, None, :3, 3]
+    count = depth.size
+    scales = np.repeat(PIXEL_SCALE * depth.reshape(-1, 1) / K[0, 0], 3, axis=1)
+    gaussians = Gaussians(
+        points.reshape(-1, 3).astype(np.float32),
+        scales.astype(np.float32),
+        np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        np.full(count, 0.999, np.float32),
+        np.full((count, 1, 3), 0.5, np.float32),
+    )
+    return gaussians, Surfaces(points, depth, extrinsics, np.tile(INTRINSICS, (len(depth), 1, 1)))
+
+
+def closed(depth: np.ndarray, extrinsics: np.ndarray) -> tuple[Gaussians, Gaussians]:
+    """Pixel-sized Gaussians before and after the closing of holes."""
+    gaussians, surfaces = pixel_sized(depth, extrinsics)
+    return gaussians, close_holes(gaussians, surfaces, np.ones(depth.shape, bool))
+
+
+def orbiting(degrees: float) -> np.ndarray:
+    """A camera turned about (0, 0, DISTANCE), which it looks at, camera-to-world [4, 4]."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    pose = np.eye(4)
+    pose[:3, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
+    pose[:3, 3] = [0, 0, DISTANCE] - pose[:3, :3] @ [0, 0, DISTANCE]
+    return pose
+
+
+def approached() -> np.ndarray:
+    pose = np.eye(4)
+    pose[2, 3] = DISTANCE / 2
+    return pose
+
+
+def least_alpha(gaussians: Gaussians, pose: np.ndarray) -> float:
+    return float(render_view(gaussians, pose, K, SIZE, SIZE).alpha[MIDDLE, MIDDLE].min())
+
+
+@pytest.mark.parametrize(
+    ("degrees", "pose"),
+    [(45, orbiting(-45)), (45, orbiting(20)), (60, orbiting(-45)), (0, orbiting(45)), (0, approached())],
+    ids=["slanted, seen frontally", "slanted, seen flatter", "steep, from aside", "frontal, from aside", "from near"],
+)
+def test_a_plane_stays_closed(degrees: float, pose: np.ndarray) -> None:
+    before, after = closed(slanted(degrees)[None], shifted(0))
+    assert least_alpha(after, pose) > 0.95
+    assert least_alpha(after, pose) > least_alpha(before, pose)
+
+
+def test_round_gaussians_leave_holes() -> None:
+    """What the test above shows is not so without it."""
+    before, _ = closed(slanted(45)[None], shifted(0))
+    assert least_alpha(before, orbiting(-45)) < 0.9
+
+
+def test_shear_along_the_rays_keeps_the_image_in_its_own_view() -> None:
+    """Two views of a plane, so that the second has no growth to show beside the shear."""
+    depth = np.stack([slanted(30)] * 3)
+    _, after = closed(depth, np.tile(np.eye(4), (3, 1, 1)))
+    before, _ = pixel_sized(depth, np.tile(np.eye(4), (3, 1, 1)))
+    found, expected = (render_view(each, np.eye(4), K, SIZE, SIZE) for each in (after, before))
+    np.testing.assert_allclose(found.rgb[MIDDLE, MIDDLE], expected.rgb[MIDDLE, MIDDLE], atol=0.02)
+    np.testing.assert_allclose(after.means[: len(before.means)], before.means)
+
+
+def patch_before_a_wall() -> np.ndarray:
+    depth = np.full((1, SIZE, SIZE), 2 * DISTANCE, np.float32)
+    depth[0, 14:34, 14:34] = DISTANCE
+    return depth
+
+
+def test_background_goes_on_behind_an_edge() -> None:
+    """A camera beside the view sees the wall in the gap beside the patch."""
+    before, after = closed(patch_before_a_wall(), shifted(0))
+    assert len(after) > len(before)
+    aside = shifted(0.4)[0]
+    around = slice(14, 34), slice(5, 43)  # the patch, not the borders of the image
+    gaps = [float((render_view(g, aside, K, SIZE, SIZE).alpha[around] < 0.5).sum()) for g in (before, after)]
+    assert gaps[0] > 15 and gaps[1] == 0
+
+
+def test_what_is_added_is_hidden_from_the_view_itself() -> None:
+    before, after = closed(patch_before_a_wall(), shifted(0))
+    added = after.means[len(before) :]
+    assert (added[:, 2] > DISTANCE * 1.05).all()
+    row, column = (np.floor(added[:, axis] / added[:, 2] * K[0, 0] + SIZE / 2).astype(int) for axis in (1, 0))
+    assert (patch_before_a_wall()[0][row, column] == DISTANCE).all()
+
+
+def test_nothing_is_added_where_another_view_looks() -> None:
+    """A second camera that sees the wall beside the patch has nothing put before it."""
+    gaussians, surfaces = pixel_sized(np.concatenate([patch_before_a_wall()] * 2), shifted(0, 0))
+    surfaces.depth[1] = 20 * DISTANCE
+    after = close_holes(gaussians, surfaces, np.ones(surfaces.depth.shape, bool))
+    assert len(after) == len(gaussians)
+
+
+def test_removed_pixels_stay_removed() -> None:
+    gaussians, surfaces = pixel_sized(slanted(20)[None], shifted(0))
+    kept = np.ones((1, SIZE, SIZE), bool)
+    kept[0, :10] = False
+    assert len(close_holes(gaussians, surfaces, kept)) == kept.sum()
