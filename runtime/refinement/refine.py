@@ -76,13 +76,15 @@ def refine(
     at the start have no weight, so that no Gaussian is stretched to fill them.
     """
     compile_all()
+    started = time.perf_counter()
     optimiser = Optimiser(gaussians, views, options)
+    # It went through all views, which the contributions at the end do as well.
+    limit = options.seconds - (time.perf_counter() - started)
     order = _view_order(len(views), options.seed)
     psnr: list[float] = []
-    started = time.perf_counter()
     prune_at = int(PRUNE_AFTER * options.steps) if options.max_gaussians else -1
     for step in progress(range(options.steps), "refining", detail=lambda: f"{psnr[-1]:.1f} dB" if psnr else ""):
-        elapsed = (time.perf_counter() - started) / options.seconds
+        elapsed = (time.perf_counter() - started) / limit if limit > 0 else 1
         if elapsed >= 1:
             break
         if step == prune_at and len(optimiser.parameters) > options.max_gaussians:
