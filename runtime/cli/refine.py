@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from ..refinement.refine import PosedImage
 
-STEPS_PER_VIEW = 15
+STEPS_PER_VIEW = 20
 MAX_STEPS = 100_000
 STEPS_HELP = f"Steps of the optimiser, one image each; else {STEPS_PER_VIEW} for each image."
 

@@ -8,7 +8,7 @@ from typing import Any
 # others; larger ones that let light through have gradients and average.
 FEW_VIEWS = 2
 FEW_VIEWS_OPACITY, FEW_VIEWS_SCALE = 0.9, 2.0
-MANY_VIEWS_OPACITY, MANY_VIEWS_SCALE = 0.7, 1.8
+MANY_VIEWS_OPACITY, MANY_VIEWS_SCALE = 0.35, 1.8
 
 
 @dataclass(frozen=True)
