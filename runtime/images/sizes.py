@@ -5,7 +5,8 @@ from math import ceil, log
 from ..errors import InputError
 from ..system.limits import SIDE_PIXELS, parse_whole_number
 
-MAX_EXTRA_AREA = 1.3  # by which the pixels of a whole frame may exceed those asked for, where there is a choice
+# Factors by which the pixels of a whole frame may exceed those asked for: in general, and rather than be cropped.
+MAX_EXTRA_AREA, MAX_AREA_UNCROPPED = 1.3, 1.5
 AREA_WEIGHT = 0.5  # of the logarithm of the area against that of the aspect ratio
 MAX_STRETCH = 1.15  # of one axis against the other, by which a whole frame may be resized rather than cropped
 SEARCHED = 8  # multiples to try for its width, and beyond the exact one for its height
@@ -34,8 +35,8 @@ def is_valid_size(height: int, width: int, multiple: int) -> bool:
 def whole_frame_size(aspect: float, area: int, multiple: int) -> tuple[int, int]:
     """Height and width, multiples of `multiple`, of the aspect ratio (height / width) and of `area` pixels or more.
 
-    Its aspect ratio is near, within MAX_STRETCH, so that nothing is cropped, and its pixels are few more: at most
-    MAX_EXTRA_AREA times the area, but for long frames of few multiples.
+    Its aspect ratio is near, within MAX_STRETCH if possible, so that nothing is cropped. Its pixels are few more, at
+    most MAX_EXTRA_AREA times the area, or MAX_AREA_UNCROPPED where frames of few multiples would else be cropped.
     """
     candidates = []
     for rows in range(2, round((area * aspect) ** 0.5 / multiple) + SEARCHED):
@@ -46,7 +47,8 @@ def whole_frame_size(aspect: float, area: int, multiple: int) -> tuple[int, int]
             cost = stretch + AREA_WEIGHT * log(height * width / area)
             cropped, large = stretch > log(MAX_STRETCH), height * width > MAX_EXTRA_AREA * area
             candidates.append((cropped, large, cost, height, width))
-    return min(candidates)[3:]
+    fitting = [found for found in candidates if found[3] * found[4] <= MAX_AREA_UNCROPPED * area]
+    return min(fitting or candidates)[3:]
 
 
 def describe_size_rule(multiple: int) -> str:
