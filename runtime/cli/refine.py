@@ -7,6 +7,7 @@ import typer
 
 from ..cameras.io import CameraFormat
 from ..errors import InputError
+from ..reconstruction.quality import MAX_STEPS, PRESETS, Quality
 from .interrupting import StopOnInterrupt
 from .options import Cameras, CamerasFormat, Config, Images, MaxGaussians, Overwrite, Quiet, Verbose
 from .outputs import command, outputs
@@ -18,8 +19,7 @@ if TYPE_CHECKING:
 
     from ..refinement.refine import PosedImage
 
-STEPS_PER_VIEW = 20
-MAX_STEPS = 100_000
+STEPS_PER_VIEW = PRESETS[Quality.STANDARD].steps_per_view
 STEPS_HELP = f"Steps of the optimiser, one image each; else {STEPS_PER_VIEW} for each image."
 
 
