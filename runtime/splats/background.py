@@ -23,7 +23,7 @@ def continue_background(gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarr
     depth = surfaces.depth[view]
     source, continued = np.full(depth.shape, -1), np.zeros(depth.shape)
     smooth = depth_jumps(depth[None])[0] <= MAX_STEP
-    _find_sources(depth, surfaces.slopes(view), surfaces.Ks[view], smooth & kept[view], source, continued)
+    _find_sources(depth, surfaces.slopes[view], surfaces.Ks[view], smooth & kept[view], source, continued)
     row, column = np.nonzero(source >= 0)
     pose = surfaces.extrinsics[view]
     points = (surfaces.rays(view)[row, column] * continued[row, column, None]) @ pose[:3, :3].T + pose[:3, 3]

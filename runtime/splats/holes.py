@@ -18,10 +18,11 @@ def close_holes(gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarray) -> G
     width].
     """
     views, pixels = len(kept), kept[0].size
+    spacings = surfaces.spacings  # computed once, and not by each thread
 
     def close(view: int) -> tuple[Gaussians, Gaussians]:
         own = gaussians.select(np.arange(pixels * view, pixels * (view + 1)))
-        fitted = fit_to_surface(own, surfaces, kept, view)
+        fitted = fit_to_surface(own, surfaces, spacings, kept, view)
         return fitted.select(kept[view].ravel()), continue_background(fitted, surfaces, kept, view)
 
     with ThreadPoolExecutor(min(views, os.cpu_count() or 1)) as pool:

@@ -51,11 +51,20 @@ def points_from_depth(
 def unproject(depth: np.ndarray, extrinsics: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
     """World coordinates of every pixel's centre, float64 [views, height, width, 3]; arguments as above."""
     views, height, width = depth.shape
-    x, y = (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
-    pixels = np.stack([*np.meshgrid(x, y), np.ones((height, width))], axis=-1).reshape(-1, 3)
-    rays = pixels @ np.linalg.inv(intrinsics.astype(np.float64)).swapaxes(1, 2)  # [views, height * width, 3], z = 1
+    rays = pixel_rays(intrinsics, height, width).reshape(views, -1, 3)
     points = rays * depth.reshape(views, -1, 1)
     return (points @ extrinsics[:, :3, :3].swapaxes(1, 2) + extrinsics[:, None, :3, 3]).reshape(*depth.shape, 3)
+
+
+def pixel_rays(intrinsics: np.ndarray, height: int, width: int) -> np.ndarray:
+    """The rays through the pixels' centres in the camera's frame, with z = 1, float64 [..., height, width, 3].
+
+    intrinsics: normalised, [..., 3, 3].
+    """
+    x, y = (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
+    pixels = np.stack([*np.meshgrid(x, y), np.ones((height, width))], axis=-1).reshape(-1, 3)
+    rays = pixels @ np.linalg.inv(intrinsics.astype(np.float64)).swapaxes(-1, -2)
+    return np.asarray(rays.reshape(*intrinsics.shape[:-2], height, width, 3))
 
 
 def points_from_gaussians(gaussians: Gaussians) -> PointCloud:

@@ -27,17 +27,19 @@ from .surfaces import Surfaces, project_to_pixel
 GROWTHS = np.array([1.3, 1.1, 1.0])
 
 
-def fit_to_surface(gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarray, view: int) -> Gaussians:
+def fit_to_surface(
+    gaussians: Gaussians, surfaces: Surfaces, spacings: np.ndarray, kept: np.ndarray, view: int
+) -> Gaussians:
     """The Gaussians of a view, one for each pixel, in shapes that close the surface.
 
     Those of surfaces that no more neighbours contradict than confirm are sheared along their rays, except where a
-    neighbour has denser samples of the surface. All of them are larger where few views see the surface. kept: the
-    pixels whose Gaussians are kept, bool [views, height, width].
+    neighbour has denser samples of the surface. All of them are larger where few views see the surface. spacings:
+    the surfaces' own. kept: the pixels whose Gaussians are kept, bool [views, height, width].
     """
     shape = surfaces.depth.shape[1:]
     stretched, seen = np.zeros(shape, bool), np.zeros(shape, np.int64)
     _compare(
-        surfaces.points[view], surfaces.spacings[view], surfaces.neighbors[view], surfaces.depth, surfaces.spacings,
+        surfaces.points[view], spacings[view], surfaces.neighbors[view], surfaces.depth, spacings,
         kept, surfaces.viewmats, surfaces.Ks, stretched, seen,
     )  # fmt: skip
     members = np.flatnonzero(stretched & kept[view])
@@ -50,7 +52,7 @@ def fit_to_surface(gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarray, v
 
 def _shears(surfaces: Surfaces, view: int, members: np.ndarray) -> np.ndarray:
     """M in world axes, [members, 3, 3], of some pixels of a view."""
-    rays, slopes = surfaces.rays(view).reshape(-1, 3)[members], surfaces.slopes(view).reshape(-1, 2)[members]
+    rays, slopes = surfaces.rays(view).reshape(-1, 3)[members], surfaces.slopes[view].reshape(-1, 2)[members]
     along = np.concatenate([slopes, -(slopes * rays[:, :2]).sum(axis=1, keepdims=True)], axis=1)
     rotation = surfaces.extrinsics[view, :3, :3]
     return np.eye(3) + (rays @ rotation.T)[:, :, None] * (along @ rotation.T)[:, None, :]

@@ -8,6 +8,7 @@ import numpy as np
 from ..geometry.intrinsics import denormalize_intrinsics
 from ..geometry.rigid import invert_rigid
 from ..system.compilation import compiled
+from .points import pixel_rays
 
 # A colour agrees with a view's if it is within COLOR_TOLERANCE of what COLOR_WINDOW x COLOR_WINDOW pixels span there:
 # fine texture is sampled differently by each view, and highlights move.
@@ -46,7 +47,8 @@ class Surfaces:
         self.points, self.depth = (np.ascontiguousarray(array, np.float32) for array in (points, depth))
         self.extrinsics = extrinsics.astype(np.float64)
         self.viewmats = np.stack([invert_rigid(pose) for pose in self.extrinsics])
-        self.Ks = denormalize_intrinsics(intrinsics, width, height).astype(np.float64)
+        self.intrinsics = intrinsics
+        self.Ks = denormalize_intrinsics(intrinsics, width, height)
 
     @cached_property
     def color_ranges(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -61,35 +63,33 @@ class Surfaces:
         most = np.stack([np.minimum(cv2.dilate(image, window), 255 - tolerance) + tolerance for image in colors])
         return colors, least, most
 
-    def slopes(self, view: int) -> np.ndarray:
-        """How far a view's surface goes along each pixel's ray for a step across it at its depth, [height, width, 2].
+    @cached_property
+    def slopes(self) -> np.ndarray:
+        """How far the surfaces go along each pixel's ray for a step across it, float64 [views, height, width, 2].
 
         From differences of inverse depth, which is linear in pixels on a plane, to the neighbour that differs less:
         they do not cross depth edges. At most MAX_SLOPE long.
         """
-        inverse, K = 1 / self.depth[view].astype(np.float64), self.Ks[view]
-        slopes = -np.stack([K[0, 0] * _gradient(inverse, 1), K[1, 1] * _gradient(inverse, 0)], axis=-1)
-        slopes /= inverse[..., None]
-        steepness = np.linalg.norm(slopes, axis=-1, keepdims=True)
-        return np.asarray(slopes * np.minimum(1, MAX_SLOPE / np.maximum(steepness, MAX_SLOPE)))
+        slopes = np.empty((*self.depth.shape, 2))
+        for view, K in enumerate(self.Ks):
+            inverse = 1 / self.depth[view].astype(np.float64)
+            slopes[view, ..., 0] = -K[0, 0] * _gradient(inverse, 1) / inverse
+            slopes[view, ..., 1] = -K[1, 1] * _gradient(inverse, 0) / inverse
+            steepness = np.linalg.norm(slopes[view], axis=-1, keepdims=True)
+            slopes[view] *= np.minimum(1, MAX_SLOPE / np.maximum(steepness, MAX_SLOPE))
+        return slopes
 
     def rays(self, view: int) -> np.ndarray:
         """The rays through a view's pixels in the camera's frame, with z = 1, [height, width, 3]."""
-        (height, width), K = self.depth.shape[1:], self.Ks[view]
-        x = (np.arange(width) + 0.5 - K[0, 2]) / K[0, 0]
-        y = (np.arange(height)[:, None] + 0.5 - K[1, 2]) / K[1, 1]
-        return np.stack(np.broadcast_arrays(x, y, 1.0), axis=-1)
+        return pixel_rays(self.intrinsics[view], *self.depth.shape[1:])
 
     @cached_property
     def spacings(self) -> np.ndarray:
         """Distances between samples along the slope, in world units, float32 [views, height, width]."""
-        focal = self.Ks[:, 0, 0]
-        return np.stack(
-            [
-                depth / focal[view] * np.hypot(1, np.linalg.norm(self.slopes(view), axis=-1))
-                for view, depth in enumerate(self.depth)
-            ]
-        ).astype(np.float32)
+        spacings = np.empty(self.depth.shape, np.float32)
+        for view, depth in enumerate(self.depth):
+            spacings[view] = depth / self.Ks[view, 0, 0] * np.hypot(1, np.linalg.norm(self.slopes[view], axis=-1))
+        return spacings
 
 
 def _gradient(inverse: np.ndarray, axis: int) -> np.ndarray:
