@@ -17,6 +17,7 @@ from .terminal import run, say
 if TYPE_CHECKING:
     import numpy as np
 
+    from ..cameras.camera import Camera
     from ..refinement.refine import PosedImage
 
 STEPS_PER_VIEW = PRESETS[Quality.STANDARD].steps_per_view
@@ -43,6 +44,12 @@ def refine(
     max_side: Annotated[int, typer.Option(help="Longer side of the images, in pixels.", min=16, max=4096)] = 512,
     seed: Annotated[int, typer.Option(help="Of the order of the images.", min=0)] = 0,
     max_gaussians: MaxGaussians = 0,
+    refine_poses: Annotated[
+        Path | None,
+        typer.Option(
+            help="Refine the poses of the cameras, too, and write the cameras to this .json file.", show_default=False
+        ),
+    ] = None,
     overwrite: Overwrite = False,
     config: Config = None,
     verbose: Verbose = 0,
@@ -54,7 +61,9 @@ def refine(
 
     Ctrl-C ends the refinement and writes what it has reached.
     """
-    from ..refinement.options import RefinementOptions
+    from ..cameras.io import write_cameras
+    from ..refinement.options import POSE_LR, RefinementOptions
+    from ..refinement.poses import refined_cameras
     from ..refinement.refine import refine as fit
     from ..splats.io import read_offset, read_splats, splat_suffix, write_splats
     from ..system.files import scratch_folder
@@ -64,22 +73,31 @@ def refine(
     if out is None:
         raise InputError("--out: missing; give the splat file to write, such as refined.ply")
     splat_suffix(out)
-    _protect_inputs(scene, cameras, images or [], out)
+    _protect_inputs(scene, cameras, images or [], out, refine_poses)
     gaussians, offset = read_splats(scene), read_offset(scene)
     with scratch_folder() as folder:
-        views = _read_views(cameras, camera_format, images or [], offset, max_side, folder)
-    options = RefinementOptions(steps or STEPS_PER_VIEW * len(views), seed=seed, max_gaussians=max_gaussians)
+        found, views = _read_views(cameras, camera_format, images or [], offset, max_side, folder)
+    options = RefinementOptions(
+        steps or STEPS_PER_VIEW * len(views),
+        seed=seed,
+        max_gaussians=max_gaussians,
+        lr_poses=POSE_LR if refine_poses else 0,
+    )
     with StopOnInterrupt() as on_step:
         refined = fit(gaussians, views, options, on_step)
     if on_step.stopped:
         note(f"stopped after {refined.steps} of {options.steps} steps")
     for line in write_splats(out, refined.gaussians, offset):
         note(f"note: {line}")
+    if refine_poses:
+        write_cameras(refine_poses, refined_cameras(found, refined.viewmats, offset))
     first, last = refined.psnr[: len(views)], refined.psnr[-len(views) :]
     say(
         f"wrote {out}: {len(refined.gaussians):,} Gaussians, {refined.steps} steps on {len(views)} images, their PSNR "
         f"{sum(first) / len(first):.2f} dB in the first round and {sum(last) / len(last):.2f} dB in the last"
     )
+    if refine_poses:
+        say(f"wrote {refine_poses}: {len(found)} cameras with refined poses")
 
 
 def main() -> None:
@@ -87,20 +105,25 @@ def main() -> None:
     run(refine)
 
 
-def _protect_inputs(scene: Path, cameras: Path, images: list[Path], out: Path) -> None:
-    """Find out before the work whether the file can be written, and is none of the files to read."""
+def _protect_inputs(scene: Path, cameras: Path, images: list[Path], out: Path, poses: Path | None) -> None:
+    """Find out before the work whether the files can be written, and are none of the files to read."""
     from .input_files import camera_files, given_images
 
     outputs().reads("the scene", [scene])
     outputs().reads("the cameras", camera_files(cameras))
     outputs().reads("an image", given_images(images))
     outputs().writes("--out", [out])
+    if poses:
+        outputs().writes("--refine-poses", [poses])
 
 
 def _read_views(
     cameras: Path, form: CameraFormat | None, images: list[Path], offset: "np.ndarray", max_side: int, folder: Path
-) -> "list[PosedImage]":
-    """The images with their cameras in the scene's world; `folder` is for the frames of a video."""
+) -> "tuple[list[Camera], list[PosedImage]]":
+    """The images' cameras as given, and the images with their cameras in the scene's world.
+
+    folder: for the frames of a video.
+    """
     from ..cameras.camera import offset_cameras
     from ..cameras.io import read_cameras
     from ..refinement.views import load_posed_images
@@ -109,5 +132,6 @@ def _read_views(
 
     files = find_input_images(images, cameras, form, folder)
     pairs = match_images_to_cameras(files, read_cameras(cameras, files, form))
-    placed = offset_cameras([camera for _, camera in pairs], offset)
-    return load_posed_images([(file, camera) for (file, _), camera in zip(pairs, placed, strict=True)], max_side)
+    found = [camera for _, camera in pairs]
+    placed = zip(pairs, offset_cameras(found, offset), strict=True)
+    return found, load_posed_images([(file, camera) for (file, _), camera in placed], max_side)

@@ -458,6 +458,58 @@ def parameter_gradients(
 
 
 @compiled_fast
+def pose_gradient(
+    means: np.ndarray,
+    quats: np.ndarray,
+    log_scales: np.ndarray,
+    sh: np.ndarray,
+    viewmat: np.ndarray,
+    K: np.ndarray,
+    width: int,
+    height: int,
+    start: int,
+    stop: int,
+    projected: np.ndarray,
+    boxes: np.ndarray,
+    offsets: np.ndarray,
+    gradients: np.ndarray,
+    out: np.ndarray,  # [6]
+) -> None:
+    """Fill the gradient of the view's pose over the Gaussians from `start` to `stop`.
+
+    out: of a rotation vector of the world about the camera's centre, then of a translation of the world. Moving the
+    camera is moving all Gaussians the other way. Their SH turn with the world, so that the rotation changes no colour:
+    what the means' gradients have of it, d x dL/dd of the viewing direction d, is taken away.
+    """
+    camera, work, given = np.empty(3), np.zeros((4, 3, 3)), np.empty(ENTRY)
+    basis, gradient = np.empty((2, sh.shape[1])), np.empty(11 + 3 * sh.shape[1])
+    for axis in range(3):
+        camera[axis] = -np.sum(viewmat[:3, axis] * viewmat[:3, 3])
+    out[:] = 0.0
+    for index in range(start, stop):
+        if boxes[index, 3] <= boxes[index, 2]:
+            continue
+        _sum_entries(index, boxes, offsets, gradients, given)
+        _gaussian_gradient(
+            means[index], quats[index], log_scales[index], sh[index], projected[index], given,
+            viewmat, K, width, height, camera, work, basis, gradient,
+        )  # fmt: skip
+        arm, turn = means[index] - camera, work[3, 2]
+        distance = max(np.sqrt(np.sum(arm * arm)), 1e-12)
+        w, imaginary, for_imaginary = quats[index, 0], quats[index, 1:], gradient[4:7]
+        for axis in range(3):
+            i, j = (axis + 1) % 3, (axis + 2) % 3
+            torque = arm[i] * gradient[j] - arm[j] * gradient[i]
+            if sh.shape[1] > 1:
+                torque -= (arm[i] * turn[j] - arm[j] * turn[i]) / distance
+            # A rotation by a small vector a adds (0, a / 2) q to a quaternion q.
+            spin = w * for_imaginary[axis] - imaginary[axis] * gradient[3]
+            spin += imaginary[i] * for_imaginary[j] - imaginary[j] * for_imaginary[i]
+            out[axis] += torque + spin / 2
+            out[3 + axis] += gradient[axis]
+
+
+@compiled_fast
 def adam_step(
     means: np.ndarray,
     quats: np.ndarray,

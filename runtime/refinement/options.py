@@ -10,6 +10,9 @@ FEW_VIEWS = 2
 FEW_VIEWS_OPACITY, FEW_VIEWS_SCALE = 0.9, 2.0
 MANY_VIEWS_OPACITY, MANY_VIEWS_SCALE = 0.35, 1.8
 
+# Learning rate of poses where they are refined.
+POSE_LR = 3e-4
+
 
 @dataclass(frozen=True)
 class RefinementOptions:
@@ -20,6 +23,7 @@ class RefinementOptions:
     max_opacity, scale_factor: limit the opacities and enlarge the scales at the start: saturated opacities have almost
     no gradient, and lower ones leave gaps between splats.
     ssim_weight: of 1 - SSIM against L1. lr_*: learning rates of Adam; of the means, relative to the median depth.
+    lr_poses: of the views' poses, in radians, and relative to the median depth; 0 leaves them as given.
     final_lr: what is left of the learning rates at the end, as they decay exponentially.
     """
 
@@ -37,6 +41,7 @@ class RefinementOptions:
     lr_dc: float = 3e-2
     lr_sh: float = 6e-3
     lr_exposure: float = 1e-3
+    lr_poses: float = 0.0
     final_lr: float = 0.1
 
 

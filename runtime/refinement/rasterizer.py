@@ -161,6 +161,21 @@ class GradientRasterizer:
         self._over_gaussians(differentiate)
         return out
 
+    def pose_gradient(self, done: Pass, gradients: np.ndarray) -> np.ndarray:
+        """Gradient of a pass's pose from those of its entries, float64 [6] (`kernels.pose_gradient`)."""
+        p, target = self.parameters, done.target
+        parts = np.zeros((-(-len(p) // BLOCK), 6))
+
+        def differentiate(start: int, stop: int) -> None:
+            kernels.pose_gradient(
+                p.means, p.quats, p.log_scales, p.sh, target.viewmat, target.K, target.width, target.height,
+                start, stop, done.projected, done.boxes, done.offsets, gradients, parts[start // BLOCK],
+            )  # fmt: skip
+
+        self._over_gaussians(differentiate)
+        total: np.ndarray = parts.sum(axis=0)  # in an order that does not depend on the threads
+        return total
+
     def step(
         self,
         done: Pass,

@@ -13,7 +13,9 @@ from ..splats.gaussians import Gaussians
 from ..system.progress import progress
 from .losses import photometric_loss
 from .options import RefinementOptions
-from .rasterizer import BETA_1, BETA_2, EPSILON, GradientRasterizer, Parameters, Target, compile_all
+from .poses import move_world
+from .rasterizer import GradientRasterizer, Parameters, Target, compile_all
+from .view_adam import ViewAdam
 
 MAX_TRANSMITTANCE = 0.5  # of a pixel that counts as covered
 DEFAULT = RefinementOptions()
@@ -49,13 +51,14 @@ class Refined:
     """A refined scene.
 
     psnr: of the views before their step, one for each step. gains, offsets: of each view and channel, [views, 3]: an
-    image is gain * render + offset.
+    image is gain * render + offset. viewmats: of the views, refined if asked for, [views, 4, 4].
     """
 
     gaussians: Gaussians
     psnr: list[float]
     gains: np.ndarray
     offsets: np.ndarray
+    viewmats: np.ndarray
 
     @property
     def steps(self) -> int:
@@ -95,7 +98,8 @@ def refine(
             break
     contributions = optimiser.contributions()
     optimiser.keep(strongest(contributions, options.max_gaussians or len(contributions)))
-    return Refined(_gaussians(optimiser.parameters), psnr, optimiser.gains, optimiser.offsets)
+    viewmats = np.stack([view.viewmat for view in optimiser.views])
+    return Refined(_gaussians(optimiser.parameters), psnr, optimiser.gains, optimiser.offsets, viewmats)
 
 
 class Optimiser:
@@ -105,12 +109,12 @@ class Optimiser:
         self.options = options
         self.parameters = _parameters(gaussians, options)
         self.rasterizer = GradientRasterizer(self.parameters)
-        self.lr = _learning_rates(self.parameters, _median_depth(self.parameters, views), options)
+        self.depth = _median_depth(self.parameters, views)
+        self.lr = _learning_rates(self.parameters, self.depth, options)
         self.moments = np.zeros((len(self.parameters), 2, self.parameters.columns), np.float32)
         self.views = [_covered(self.rasterizer, view) for view in progress(views, "finding what the scene covers")]
         self.gains, self.offsets = np.ones((len(views), 3)), np.zeros((len(views), 3))
-        self.exposure_moments = np.zeros((len(views), 2, 6))
-        self.visits = np.zeros(len(views), int)
+        self.exposure_adam, self.pose_adam = ViewAdam(len(views), 6), ViewAdam(len(views), 6)
         self.steps = 0
 
     def step(self, index: int, lr: float) -> float:
@@ -122,6 +126,8 @@ class Optimiser:
         loss = photometric_loss(rendered, view.image, view.weights, self.options.ssim_weight)
         gradients = self.rasterizer.backward(done, loss.gradient * gain)
         self.steps += 1
+        if self.options.lr_poses:
+            self._step_pose(index, self.rasterizer.pose_gradient(done, gradients), lr)
         self.rasterizer.step(done, gradients, self.moments, self.lr * lr, self.steps)
         self._step_exposure(index, loss.gradient, done.rgb, lr)
         return _psnr(rendered, view)
@@ -146,16 +152,17 @@ class Optimiser:
     def _step_exposure(self, index: int, for_image: np.ndarray, rgb: np.ndarray, lr: float) -> None:
         """Adam on a view's gains and offsets. The mean over the views stays 1 and 0: else the scene would drift."""
         gradient = np.concatenate([(for_image * rgb).sum((0, 1)), for_image.sum((0, 1))]).astype(np.float64)
-        first, second = self.exposure_moments[index]
-        first += (1 - BETA_1) * (gradient - first)
-        second += (1 - BETA_2) * (gradient**2 - second)
-        self.visits[index] += 1
-        count = self.visits[index]
-        update = first / (1 - BETA_1**count) / (np.sqrt(second / (1 - BETA_2**count)) + EPSILON)
-        self.gains[index] -= self.options.lr_exposure * lr * update[:3]
-        self.offsets[index] -= self.options.lr_exposure * lr * update[3:]
+        step = self.options.lr_exposure * lr * self.exposure_adam.direction(index, gradient)
+        self.gains[index] -= step[:3]
+        self.offsets[index] -= step[3:]
         self.gains /= self.gains.mean(axis=0)
         self.offsets -= self.offsets.mean(axis=0)
+
+    def _step_pose(self, index: int, gradient: np.ndarray, lr: float) -> None:
+        """Adam on a view's pose; the translation's learning rate is relative to the median depth."""
+        motion = -self.options.lr_poses * lr * self.pose_adam.direction(index, gradient)
+        motion[3:] *= self.depth
+        self.views[index] = replace(self.views[index], viewmat=move_world(self.views[index].viewmat, motion))
 
 
 def strongest(contributions: np.ndarray, count: int) -> np.ndarray:

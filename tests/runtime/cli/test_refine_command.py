@@ -46,6 +46,17 @@ def test_writes_a_refined_scene(folder: Path, capsys: pytest.CaptureFixture[str]
     assert last > first + 1
 
 
+def test_writes_refined_poses(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    steps = ("--steps", "8", "--max-side", "64")
+    assert run_command(main, *GIVEN, "-o", "out.ply", *steps, "--refine-poses", "poses.json") == 0
+    assert "wrote poses.json" in capsys.readouterr().out
+    before, after = read_cameras(Path("transforms.json")), read_cameras(Path("poses.json"))
+    for given, refined in zip(before, after, strict=True):
+        assert refined.name == given.name
+        np.testing.assert_array_equal(refined.K, given.K)
+        assert 0 < np.abs(refined.extrinsics - given.extrinsics).max() < 0.1
+
+
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
@@ -54,6 +65,7 @@ def test_writes_a_refined_scene(folder: Path, capsys: pytest.CaptureFixture[str]
         ((*GIVEN, "-o", "scene.ply"), "scene.ply"),
         ((*GIVEN, "-o", "out.txt"), "out.txt"),
         (("none.ply", *GIVEN[1:], "-o", "out.ply"), "none.ply"),
+        ((*GIVEN, "-o", "out.ply", "--refine-poses", "transforms.json"), "transforms.json"),
     ],
 )
 def test_invalid_input_is_one_line(

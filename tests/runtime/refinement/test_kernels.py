@@ -1,11 +1,13 @@
 """The kernels of refinement: gsplat's reference images, gradients against PyTorch and finite differences."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from idesplat.runtime.refinement.losses import photometric_loss
+from idesplat.runtime.refinement.poses import move_world
 from idesplat.runtime.refinement.rasterizer import GradientRasterizer, Parameters, Target
 from idesplat.tools.training.rasterizer import rasterize
 
@@ -107,6 +109,23 @@ def test_gradients_match_finite_differences() -> None:
             numeric.append(differences)
     expected = np.array(numeric).T
     np.testing.assert_allclose(gradients, expected, rtol=0, atol=2e-5 * np.abs(expected).max())
+
+
+def test_the_gradient_of_the_pose_matches_finite_differences() -> None:
+    """In float64: moved and turned worlds are rendered by moved and turned cameras."""
+    parameters, target = random_parameters(4, 12, 2, np.float64), side_view(12, 10)
+    weights = np.random.default_rng(2).normal(size=(10, 12, 3))
+    rasterizer = GradientRasterizer(parameters)
+
+    def loss(motion: np.ndarray) -> float:
+        moved = replace(target, viewmat=move_world(target.viewmat, motion))
+        return float((rasterizer.forward(moved).rgb.astype(np.float64) * weights).sum())
+
+    done = rasterizer.forward(target)
+    gradient = rasterizer.pose_gradient(done, rasterizer.backward(done, weights))
+    step = 1e-5 * np.eye(6)
+    expected = np.array([(loss(row) - loss(-row)) / 2e-5 for row in step])
+    np.testing.assert_allclose(gradient, expected, rtol=0, atol=2e-5 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("ssim_weight", [0.0, 0.2, 1.0])

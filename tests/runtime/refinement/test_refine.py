@@ -8,6 +8,7 @@ from idesplat.runtime.refinement.rasterizer import GradientRasterizer, Parameter
 from idesplat.runtime.refinement.refine import PosedImage, RefinementOptions, refine
 from idesplat.runtime.rendering.render import render_view
 from idesplat.runtime.splats.gaussians import Gaussians
+from scipy.spatial.transform import Rotation
 
 SIZE = 32
 K = np.array([[30.0, 0, SIZE / 2], [0, 30, SIZE / 2], [0, 0, 1]])
@@ -75,6 +76,29 @@ def test_pixels_without_weight_have_no_effect(views: list[PosedImage], wrong_col
     ignored = [PosedImage(view.image, view.viewmat, view.K, np.zeros_like(view.valid)) for view in views]
     refined = refine(wrong_colours, ignored, RefinementOptions(steps=6))
     np.testing.assert_array_equal(refined.gaussians.sh, wrong_colours.sh)
+
+
+def projected(viewmat: np.ndarray) -> np.ndarray:
+    """The scene's means in an image, in pixels."""
+    points = (scene(0).means @ viewmat[:3, :3].T + viewmat[:3, 3]) @ K.T
+    return points[:, :2] / points[:, 2:]
+
+
+def test_poses_come_closer_to_the_true_ones(views: list[PosedImage]) -> None:
+    """One of three cameras is turned by half a degree, and the scene is right."""
+    turned = Rotation.from_rotvec([0, np.radians(0.5), 0]).as_matrix()
+    wrong = views[1].viewmat.copy()
+    wrong[:3] = turned @ wrong[:3]
+    given = [views[0], replace(views[1], viewmat=wrong), views[2]]
+    options = RefinementOptions(steps=90, lr_poses=1e-3, lr_means=0, lr_scales=0, lr_quats=0, lr_dc=0, lr_opacities=0)
+    refined = refine(scene(0), given, options)
+    true, before, after = (projected(viewmat) for viewmat in (views[1].viewmat, wrong, refined.viewmats[1]))
+    assert np.abs(after - true).mean() < 0.2 * np.abs(before - true).mean()
+
+
+def test_poses_stay_as_given_unless_asked(views: list[PosedImage], wrong_colours: Gaussians) -> None:
+    refined = refine(wrong_colours, views, RefinementOptions(steps=3))
+    np.testing.assert_array_equal(refined.viewmats, [view.viewmat for view in views])
 
 
 def test_no_gaussian_is_stretched_over_what_the_scene_does_not_cover(views: list[PosedImage]) -> None:
