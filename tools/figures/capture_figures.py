@@ -19,7 +19,7 @@ from ...runtime.rendering.cameras import orbit_cameras
 from ...runtime.rendering.render import render_view
 from ...runtime.splats.gaussians import Gaussians
 from ...runtime.system.files import atomic_write, make_folder, scratch_folder
-from ..evaluation.captures.capture import Capture, read_captures
+from ..evaluation.captures.capture import Capture, load_cropped, read_captures
 from ..evaluation.captures.checkouts import extract, fetch_checkout
 
 VIEWS = 6
@@ -49,7 +49,7 @@ def figures(
 def _row(capture: Capture, folder: Path) -> list[np.ndarray]:
     context, held_out = capture.window(VIEWS)
     cameras = [capture.cameras[name] for name in context]
-    images = [folder / name for name in context]
+    images = [load_cropped(folder / name, capture.crop) for name in context]
     before, after = (
         reconstruct(images, cameras, quality=quality, views="all").gaussians
         for quality in (Quality.FAST, Quality.STANDARD)
