@@ -142,11 +142,6 @@ class GradientRasterizer:
         self._over_bands(composite_backward, len(done.starts) - 1)
         return gradients
 
-    def contributions(self, done: Pass) -> np.ndarray:
-        """The sum of alpha T over the pixels of a pass, [gaussians]."""
-        weights = self.backward(done, np.zeros_like(done.rgb))[done.entries, kernels.WEIGHT]
-        return np.bincount(done.gaussians, weights, len(self.parameters))
-
     def parameter_gradients(self, done: Pass, gradients: np.ndarray) -> np.ndarray:
         """Gradients of the parameters from those of the entries, float64 [gaussians, columns]."""
         p, target = self.parameters, done.target

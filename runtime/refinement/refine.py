@@ -11,10 +11,11 @@ import numpy as np
 
 from ..splats.gaussians import Gaussians
 from ..system.progress import progress
+from .contributions import Contributions, strongest
 from .losses import photometric_loss
 from .options import RefinementOptions
 from .poses import move_world
-from .rasterizer import GradientRasterizer, Parameters, Target, compile_all
+from .rasterizer import GradientRasterizer, Parameters, Pass, Target, compile_all
 from .view_adam import ViewAdam
 
 MAX_TRANSMITTANCE = 0.5  # of a pixel that counts as covered
@@ -76,28 +77,25 @@ def refine(
 
     report: is told the step and the view's PSNR, and stops the refinement by returning False. The result depends on
     the seed alone, not on the number of threads, unless `options.seconds` ends it. Pixels that the scene does not cover
-    at the start have no weight, so that no Gaussian is stretched to fill them.
+    when a view has its first turn have no weight, so that no Gaussian is stretched to fill them.
     """
     compile_all()
     started = time.perf_counter()
     optimiser = Optimiser(gaussians, views, options)
-    # It went through all views, which the contributions at the end do as well.
-    limit = options.seconds - (time.perf_counter() - started)
     order = _view_order(len(views), options.seed)
     psnr: list[float] = []
     prune_at = int(PRUNE_AFTER * options.steps) if options.max_gaussians else -1
     for step in progress(range(options.steps), "refining", detail=lambda: f"{psnr[-1]:.1f} dB" if psnr else ""):
-        elapsed = (time.perf_counter() - started) / limit if limit > 0 else 1
+        elapsed = (time.perf_counter() - started) / options.seconds
         if elapsed >= 1:
             break
-        if step == prune_at and len(optimiser.parameters) > options.max_gaussians:
-            optimiser.keep(strongest(optimiser.contributions(), options.max_gaussians))
+        if step == prune_at:
+            optimiser.prune(options.max_gaussians)
         lr = options.final_lr ** max(step / max(options.steps - 1, 1), elapsed)
         psnr.append(optimiser.step(next(order), lr))
         if report is not None and not report(step, psnr[-1]):
             break
-    contributions = optimiser.contributions()
-    optimiser.keep(strongest(contributions, options.max_gaussians or len(contributions)))
+    optimiser.prune(options.max_gaussians)
     viewmats = np.stack([view.viewmat for view in optimiser.views])
     return Refined(_gaussians(optimiser.parameters), psnr, optimiser.gains, optimiser.offsets, viewmats)
 
@@ -112,19 +110,23 @@ class Optimiser:
         self.depth = _median_depth(self.parameters, views)
         self.lr = _learning_rates(self.parameters, self.depth, options)
         self.moments = np.zeros((len(self.parameters), 2, self.parameters.columns), np.float32)
-        self.views = [_covered(self.rasterizer, view) for view in progress(views, "finding what the scene covers")]
+        self.views = list(views)
         self.gains, self.offsets = np.ones((len(views), 3)), np.zeros((len(views), 3))
         self.exposure_adam, self.pose_adam = ViewAdam(len(views), 6), ViewAdam(len(views), 6)
+        self.contributions = Contributions(len(self.parameters), len(views))
         self.steps = 0
 
     def step(self, index: int, lr: float) -> float:
         """One step on one view, with this factor on all learning rates; the view's PSNR before it."""
+        done = self.rasterizer.forward(self.views[index].target)
+        if not self.exposure_adam.visits[index]:
+            self.views[index] = _covered(self.views[index], done)
         view = self.views[index]
-        done = self.rasterizer.forward(view.target)
         gain, offset = (values[index].astype(np.float32) for values in (self.gains, self.offsets))
         rendered = done.rgb * gain + offset
         loss = photometric_loss(rendered, view.image, view.weights, self.options.ssim_weight)
         gradients = self.rasterizer.backward(done, loss.gradient * gain)
+        self.contributions.add(done, gradients)
         self.steps += 1
         if self.options.lr_poses:
             self._step_pose(index, self.rasterizer.pose_gradient(done, gradients), lr)
@@ -132,21 +134,18 @@ class Optimiser:
         self._step_exposure(index, loss.gradient, done.rgb, lr)
         return _psnr(rendered, view)
 
-    def contributions(self) -> np.ndarray:
-        """The sum of alpha T over all pixels of all views, [gaussians]; infinite where no view has them in sight."""
-        total = np.zeros(len(self.parameters))
-        seen = np.zeros(len(self.parameters), bool)
-        for view in progress(self.views, "finding what contributes"):
-            done = self.rasterizer.forward(view.target)
-            total += self.rasterizer.contributions(done)
-            seen |= done.boxes[:, 3] > done.boxes[:, 2]
-        return np.where(seen, total, np.inf)
-
-    def keep(self, chosen: np.ndarray) -> None:
-        """Keep the Gaussians with these indices."""
-        if len(chosen) < len(self.parameters):
+    def prune(self, limit: int) -> None:
+        """Keep the Gaussians that contribute most, at most `limit` or any number for 0; none that adds nothing."""
+        if not self.steps:
+            for view in progress(self.views, "finding what contributes"):
+                done = self.rasterizer.forward(view.target)
+                self.contributions.add(done, self.rasterizer.backward(done, np.zeros_like(done.rgb)))
+        total = self.contributions.total
+        chosen = strongest(total, limit or len(total))
+        if len(chosen) < len(total):
             self.parameters = self.parameters.select(chosen)
             self.moments = self.moments[chosen]
+            self.contributions.keep(chosen)
             self.rasterizer = GradientRasterizer(self.parameters)
 
     def _step_exposure(self, index: int, for_image: np.ndarray, rgb: np.ndarray, lr: float) -> None:
@@ -165,16 +164,9 @@ class Optimiser:
         self.views[index] = replace(self.views[index], viewmat=move_world(self.views[index].viewmat, motion))
 
 
-def strongest(contributions: np.ndarray, count: int) -> np.ndarray:
-    """The indices of the Gaussians that contribute most, at most `count`, in rising order; none that adds nothing."""
-    order = np.argsort(-contributions, kind="stable")[:count]
-    return np.sort(order[contributions[order] > 0])
-
-
-def _covered(rasterizer: GradientRasterizer, view: PosedImage) -> PosedImage:
+def _covered(view: PosedImage, done: Pass) -> PosedImage:
     """The view without the pixels where less than half of the light is stopped by the scene."""
-    covered = rasterizer.forward(view.target).transmittance < MAX_TRANSMITTANCE
-    return replace(view, valid=view.valid & covered)
+    return replace(view, valid=view.valid & (done.transmittance < MAX_TRANSMITTANCE))
 
 
 def _parameters(gaussians: Gaussians, options: RefinementOptions) -> Parameters:

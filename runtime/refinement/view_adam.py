@@ -9,23 +9,23 @@ from .rasterizer import BETA_1, BETA_2, EPSILON
 
 @dataclass(eq=False)
 class ViewAdam:
-    """Some numbers of each view, stepped when the view has its turn."""
+    """Some numbers of each view, stepped when the view has its turn. visits: how often each had it."""
 
     views: int
     columns: int
+    visits: np.ndarray = field(init=False)
     _moments: np.ndarray = field(init=False)
-    _visits: np.ndarray = field(init=False)
 
     def __post_init__(self) -> None:
         self._moments = np.zeros((self.views, 2, self.columns))
-        self._visits = np.zeros(self.views, int)
+        self.visits = np.zeros(self.views, int)
 
     def direction(self, view: int, gradient: np.ndarray) -> np.ndarray:
         """The step for a view at learning rate 1, to be subtracted; gradient: [columns]."""
         first, second = self._moments[view]
         first += (1 - BETA_1) * (gradient - first)
         second += (1 - BETA_2) * (gradient**2 - second)
-        self._visits[view] += 1
-        count = self._visits[view]
+        self.visits[view] += 1
+        count = self.visits[view]
         step: np.ndarray = first / (1 - BETA_1**count) / (np.sqrt(second / (1 - BETA_2**count)) + EPSILON)
         return step
