@@ -16,6 +16,7 @@ from .interrupting import StopOnInterrupt
 from .options import (
     CamerasFormat,
     Config,
+    Device,
     Far,
     Focal,
     Images,
@@ -24,14 +25,18 @@ from .options import (
     Model,
     Near,
     Overwrite,
+    Provider,
+    ProviderOption,
     QualityOption,
     Quiet,
     Refine,
     Size,
+    Threads,
     Verbose,
 )
 from .outputs import command
 from .reporting import note
+from .session_options import session_config
 from .terminal import run, say
 
 if TYPE_CHECKING:
@@ -105,7 +110,10 @@ def infer(
         ExposureMode,
         typer.Option(help="Bring images of differing exposure and white balance to a common one, or leave them."),
     ] = ExposureMode.AUTO,
-    provider: Annotated[str, typer.Option(help="ONNX Runtime execution provider, such as CPU or CUDA.")] = "CPU",
+    provider: Provider = "CPU",
+    provider_option: ProviderOption = None,
+    device: Device = None,
+    threads: Threads = None,
     save_depth: Annotated[Path | None, typer.Option(help="Folder for depth maps with their cameras.")] = None,
     depth_format: Annotated[
         DepthFormat | None,
@@ -188,6 +196,7 @@ def infer(
     from .infer_outputs import Targets
 
     started = time.perf_counter()
+    session = session_config(threads, device, provider_option)
     given = [*(images or []), *(photos or [])]
     found = _find_cameras(given, cameras)
     targets = Targets(
@@ -226,6 +235,7 @@ def infer(
             offset=offset,
             exposure=exposure,
             provider=provider,
+            session=session,
             filters=FilterOptions() if surface else filters,
             on_inputs=targets.announce_views,
             on_step=on_step,

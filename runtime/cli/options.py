@@ -45,8 +45,44 @@ Focal = Annotated[
 Model = Annotated[
     Path | None,
     typer.Option(
-        "--model", "-m", help="A .onnx file or staged folder made by `idesplat export`; else the bundled model."
+        "--model",
+        "-m",
+        help="A .onnx file or staged folder made by `idesplat export`, or a name that `idesplat models` lists; else "
+        "the bundled model.",
+        metavar="PATH|NAME",
     ),
+]
+EXECUTION = "Where the model runs"
+Provider = Annotated[
+    str,
+    typer.Option(
+        help="Execution provider of ONNX Runtime (`idesplat bench --list-providers`), or auto: a GPU where one works, "
+        "else the CPU.",
+        metavar="auto|NAME",
+        rich_help_panel=EXECUTION,
+    ),
+]
+ProviderOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Option of the provider, as its documentation names it; may be repeated.",
+        metavar="NAME=VALUE",
+        show_default=False,
+        rich_help_panel=EXECUTION,
+    ),
+]
+Device = Annotated[
+    str | None,
+    typer.Option(
+        help="Device of the provider: its number, or its type.",
+        metavar="N|cpu|gpu|npu",
+        show_default=False,
+        rich_help_panel=EXECUTION,
+    ),
+]
+Threads = Annotated[
+    int | None,
+    typer.Option(help="CPU threads of the model, instead of one for each core.", min=1, rich_help_panel=EXECUTION),
 ]
 Size = Annotated[
     str | None,

@@ -90,7 +90,7 @@ def cache_entry(model: Path) -> CacheEntry | None:
         remove_abandoned_folders(folder)
     except (OSError, RuntimeError):  # RuntimeError: there is no home folder
         return None
-    made_for = [LAYOUT, onnxruntime.__version__, onnxruntime.get_build_info(), _cpu()]
+    made_for = [LAYOUT, onnxruntime.__version__, onnxruntime.get_build_info(), describe_cpu()]
     digest = hashlib.sha256(json.dumps(made_for).encode())
     digest.update(content)
     return CacheEntry(folder, digest.hexdigest()[:KEY_LENGTH])
@@ -101,7 +101,7 @@ def _is_regular(path: Path) -> bool:
     return stat.S_ISREG(path.stat().st_mode)
 
 
-def _cpu() -> str:
+def describe_cpu() -> str:
     """A description of the CPU's type; without /proc/cpuinfo it includes the machine's name."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()

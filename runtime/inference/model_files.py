@@ -113,11 +113,16 @@ def _check_file(path: Path) -> None:
     if size > MAX_FILE_BYTES:
         raise InputError(f"{path}: has {size >> 30} GiB, expected a graph of less than 2 GiB; is it an .onnx file?")
     if size:
-        for location in _external_files(path):
+        for location in _external_names(path):
             _check_location(path, location)
 
 
-def _external_files(path: Path) -> Iterator[str]:
+def external_files(path: Path) -> list[Path]:
+    """The files beside a graph that hold some of its weights; raises InputError if their names are not readable."""
+    return [path.parent / name for name in sorted(_external_names(path))] if path.stat().st_size else []
+
+
+def _external_names(path: Path) -> Iterator[str]:
     """The names of the files that hold some of a graph's weights."""
     with open_regular(path) as file, mmap(file.fileno(), 0, access=ACCESS_READ) as content:
         if LONG_LOCATION.search(content):

@@ -1,9 +1,11 @@
 """Prediction with an exported model: images and cameras in, depth and Gaussians out."""
 
+import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +20,10 @@ from .graph_check import check_fused, check_results, check_stage
 from .metadata import ModelMetadata, StageFile, expected_outputs
 from .model_files import ModelFiles, read_model
 from .normalization import SceneNormalization
-from .session import CPU, DEFAULT, SessionConfig, open_session, provider_name, run_limit_s, run_session
+from .providers import CPU, candidates
+from .session import DEFAULT, SessionConfig, open_session, run_limit_s, run_on_device, run_session
+
+LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -47,18 +52,26 @@ class Predictor:
     """An exported model, loaded.
 
     model: a `.onnx` of this project, a folder that `idesplat-export --staged` wrote, or what `read_model` returns.
-    provider: an ONNX Runtime execution provider, such as CPU or CUDA.
-    config: threads and profiling.
+    provider: an ONNX Runtime execution provider, such as "CPU" or "CUDA", or "auto" for a GPU where one works, else the
+    CPU; the attribute `provider` is the one that it runs on. config: the provider's device and options, threads,
+    profiling.
     Raises InputError if the model is not of this project or damaged, or the provider is not installed.
     """
 
     def __init__(self, model: Path | str | ModelFiles, provider: str = CPU, config: SessionConfig = DEFAULT) -> None:
         self.model = model if isinstance(model, ModelFiles) else read_model(model)
-        self._sessions = []
-        provider = provider_name(provider)
         started = time.perf_counter()
-        for stage in self.model.stages:
-            self._sessions.append(open_session(self.model.file_of(stage), provider, _profiled(config, stage)))
+        for self.provider in (tried := candidates(provider)):
+            try:
+                self._sessions = [
+                    open_session(self.model.file_of(stage), self.provider, _profiled(config, stage))
+                    for stage in self.model.stages
+                ]
+                break
+            except InputError as error:
+                if self.provider == tried[-1]:
+                    raise
+                LOG.info("%s", error)
         self.load_seconds = time.perf_counter() - started
         try:
             self._check_graphs()
@@ -190,14 +203,22 @@ class Predictor:
         """Stop profiling, if `config.profile` was given; returns the profiles, one file for each stage."""
         return [Path(session.end_profiling()) for session in self._sessions]
 
-    def _run(self, values: dict[str, np.ndarray], frame: SceneNormalization) -> Prediction:
+    def _run(self, inputs: Mapping[str, np.ndarray], frame: SceneNormalization) -> Prediction:
         path, seconds = self.model.path, {}
-        views, _, height, width = values["images"].shape
+        views, _, height, width = inputs["images"].shape
         limit_s = run_limit_s(views * height * width)
+        values: dict[str, Any] = dict(inputs)
+        results = self.model.stages[-1].outputs
         for stage, session, keep in zip(self.model.stages, self._sessions, self._keep, strict=True):
             started = time.perf_counter()
             with error_context(f"{path}: stage {stage.name}" if path.is_dir() else str(path)):
-                values.update(run_session(session, values, stage.outputs, limit_s))
+                if len(self._sessions) > 1 and self.provider.memory:
+                    # Tensors between stages stay in the GPU's memory, without a copy to the CPU's and back.
+                    between = set(stage.outputs) - set(results)
+                    run = run_on_device(session, values, stage.outputs, limit_s, between, self.provider.memory)
+                else:
+                    run = run_session(session, values, stage.outputs, limit_s)
+                values.update(run)
             seconds[stage.name] = time.perf_counter() - started
             values = {name: value for name, value in values.items() if name in keep}
         with error_context(str(path)):

@@ -1,30 +1,41 @@
-"""ONNX Runtime sessions: provider checks, thread and memory settings, runs with a time limit."""
+"""ONNX Runtime sessions: their provider and its device, thread and memory settings, runs with a time limit."""
 
+import io
 import logging
 import os
 import re
 import threading
 import warnings
-from collections.abc import Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stdout, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnxruntime
 
 from ..errors import InputError
 from ..system.files import check_regular
-from . import openvino
+from .engine_cache import engine_folder
 from .graph_cache import cache_entry
+from .providers import (
+    CPU,
+    DEVICE_TYPES,
+    Provider,
+    choose_device,
+    device_number,
+    device_type,
+    find_provider,
+    is_built_in,
+)
 
 LOG = logging.getLogger(__name__)
 
-CPU = "CPUExecutionProvider"
 # Errors reach the caller as exceptions; ONNX Runtime's own log would print them to the terminal a second time.
 FATAL_ONLY = 4
 AS_MANY_AS_CORES = 0  # threads
-SUFFIX = "ExecutionProvider"
 # Time limit of a run, so that a graph with an endless loop is stopped: several times what the slowest network takes on
 # one core of a slow machine.
 RUN_LIMIT_S = 900.0
@@ -35,25 +46,10 @@ MAX_REASON = 300  # characters of ONNX Runtime's messages that are quoted
 SOURCE = re.compile(r"^\S+\.(?:cc|h):\d+ .*?\) ")
 OUT_OF_MEMORY = ("Failed to allocate memory", "bad_alloc", "bad allocation", "out of memory")
 
+# Built-in providers with their options, as ONNX Runtime takes them; None where the session's options have a plug-in.
+BuiltIn = list[tuple[str, dict[str, str]]] | None
+
 onnxruntime.set_default_logger_severity(FATAL_ONLY)
-
-
-def provider_name(provider: str) -> str:
-    """The full name of a provider given as `cuda`, `CUDA` or `CUDAExecutionProvider`.
-
-    Raises InputError naming what is installed.
-    """
-    wanted = provider.removesuffix(SUFFIX).lower()
-    if wanted == openvino.PROVIDER.removesuffix(SUFFIX).lower():
-        if not openvino.installed():
-            raise InputError("execution provider OpenVINO is not installed; pip install 'idesplat[openvino]'")
-        return openvino.PROVIDER
-    available = onnxruntime.get_available_providers()
-    for name in available:
-        if name.removesuffix(SUFFIX).lower() == wanted:
-            return name
-    offered = ", ".join(name.removesuffix(SUFFIX) for name in available)
-    raise InputError(f"execution provider {provider} is not installed; this ONNX Runtime offers {offered}")
 
 
 @dataclass(frozen=True)
@@ -66,43 +62,54 @@ class SessionConfig:
     profile: Path | None = None
     # Whether ONNX Runtime optimises the graph.
     optimise: bool = True
+    # Of a provider with several devices: a number, or the type "cpu", "gpu" or "npu"; None for its usual one.
+    device: str | None = None
+    # Options of the provider by name, which replace those that it gets by default (`providers.PROVIDERS`).
+    provider_options: Mapping[str, str] = field(default_factory=dict)
 
 
 DEFAULT = SessionConfig()
 
 
 def open_session(
-    model: Path | bytes, provider: str = CPU, config: SessionConfig = DEFAULT
+    model: Path | bytes, provider: Provider | str = CPU, config: SessionConfig = DEFAULT
 ) -> onnxruntime.InferenceSession:
-    """Load a graph, from a file or its bytes, on one execution provider, given by its full name (`provider_name`).
+    """Load a graph, from a file or its bytes, on one execution provider, given by itself or by name (`find_provider`).
 
-    On the CPU a file's optimised graph is cached (`graph_cache`).
-    Raises InputError if the file cannot be loaded, if ONNX Runtime silently fell back to another provider, or if
-    OpenVINO supports no CPU of this machine.
+    On the CPU a file's optimised graph is cached (`graph_cache`); providers that compile graphs keep engines
+    (`engine_cache`). Raises InputError if the file cannot be loaded, the provider or the device is not there, or ONNX
+    Runtime would fall back to another provider.
     """
+    provider = find_provider(provider) if isinstance(provider, str) else provider
     if isinstance(model, Path):
         with suppress(OSError):  # ONNX Runtime says that there is no such file
             check_regular(model)
     options = _options(config)
-    LOG.debug("opening %s on %s with %s", "a graph in memory" if isinstance(model, bytes) else model, provider, config)
-    if provider == openvino.PROVIDER:
-        openvino.add_openvino(options)
-    if provider == CPU and isinstance(model, Path) and config.optimise:
-        cached = _open_cached(model, options)
-        if cached is not None:
-            return cached
+    name = "a graph in memory" if isinstance(model, bytes) else model
+    LOG.debug("opening %s on %s with %s", name, provider.name, config)
+    if provider.ep_name == CPU:
+        if config.device or config.provider_options:
+            raise InputError("--device and --provider-option need --provider: the CPU provider has neither")
+        if isinstance(model, Path) and config.optimise:
+            cached = _open_cached(model, options)
+            if cached is not None:
+                return cached
+    providers = _add_provider(options, model, provider, config)
     try:
-        session = _create(model, options, provider)
+        session = _create(model, options, providers)
     except Exception as error:  # ONNX Runtime raises many kinds, all derived from Exception alone
         where = "the model" if isinstance(model, bytes) else model
+        if provider.ep_name == CPU:
+            lacking = f"ONNX Runtime cannot load it ({_reason(error)}); is it an .onnx file of this project?"
+        else:
+            lacking = f"{provider.name} cannot load it ({_reason(error)}); choose another --provider"
+        raise InputError(f"{where}: {lacking}") from None
+    if session.get_providers()[0] != provider.ep_name:
         raise InputError(
-            f"{where}: ONNX Runtime cannot load it ({_reason(error)}); is it an .onnx file of this project?"
-        ) from None
-    if session.get_providers()[0] != provider:
-        raise InputError(
-            f"{provider} was asked for, but ONNX Runtime fell back to {session.get_providers()[0]}; "
+            f"{provider.name} was asked for, but ONNX Runtime fell back to {session.get_providers()[0]}; "
             "its libraries are missing or do not fit, or choose another --provider"
         )
+    _log_placement(session, provider)
     return session
 
 
@@ -135,14 +142,65 @@ def _options(config: SessionConfig) -> onnxruntime.SessionOptions:
     return options
 
 
+def _add_provider(
+    options: onnxruntime.SessionOptions, model: Path | bytes, provider: Provider, config: SessionConfig
+) -> BuiltIn:
+    """Add a plug-in's device to the options of a session; returns the built-in providers that it is opened with."""
+    if provider.ep_name == CPU:
+        return [(CPU, {})]
+    options.add_session_config_entry("session.record_ep_graph_assignment_info", "1")
+    given = dict(config.provider_options)
+    if is_built_in(provider):
+        kind, description = "", f"device {config.device or 0}"
+        if config.device is not None:
+            given = _built_in_device(provider, config.device) | given
+        device = None
+    else:
+        device = choose_device(provider, config.device)
+        kind = device_type(device)
+        description = f"{device.device.vendor} {device.device.device_id} {device.ep_metadata} {device.device.metadata}"
+    cache = None
+    if provider.caches and isinstance(model, Path):
+        cache = engine_folder(model, provider, description, given)
+    settings = provider.defaults(options.intra_op_num_threads, kind, cache) | given
+    LOG.debug("options of %s: %s", provider.name, settings)
+    if device is not None:
+        options.add_provider_for_devices([device], settings)
+        return None
+    if provider.memory == "cuda" and hasattr(onnxruntime, "preload_dlls"):
+        with redirect_stdout(io.StringIO()) as said:  # it prints what it does not find
+            onnxruntime.preload_dlls()
+        LOG.debug("loading the libraries of CUDA: %s", said.getvalue())
+    return [(provider.ep_name, settings)]
+
+
+def _built_in_device(provider: Provider, asked: str) -> dict[str, str]:
+    """The option by which a provider that is no plug-in takes --device; raises InputError."""
+    if not provider.device_option or asked.lower() in DEVICE_TYPES:
+        takes = "the number of a device" if provider.device_option else "no device; see its --provider-option"
+        raise InputError(f"--device {asked}: {provider.name} takes {takes}")
+    return {provider.device_option: str(device_number(asked))}
+
+
 def _create(
-    model: Path | bytes, options: onnxruntime.SessionOptions, provider: str = CPU
+    model: Path | bytes,
+    options: onnxruntime.SessionOptions,
+    providers: BuiltIn,
 ) -> onnxruntime.InferenceSession:
     source = model if isinstance(model, bytes) else str(model)
-    providers = None if provider == openvino.PROVIDER else [provider]  # a plug-in is given in the options
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of a provider that is not there, which `open_session` raises for
-        return onnxruntime.InferenceSession(source, options, providers=providers)
+        return onnxruntime.InferenceSession(source, options, providers=providers, enable_fallback=0)
+
+
+def _log_placement(session: onnxruntime.InferenceSession, provider: Provider) -> None:
+    """Log how many of the nodes run on the provider, and how many on the CPU because it has no kernel for them."""
+    if provider.ep_name == CPU or not LOG.isEnabledFor(logging.INFO):
+        return
+    counts: Counter[str] = Counter()
+    for part in getattr(session, "get_provider_graph_assignment_info", list)():
+        counts[part.ep_name] += len(part.get_nodes())
+    LOG.info("nodes by provider: %s", ", ".join(f"{name} {count}" for name, count in counts.most_common()))
 
 
 def _open_cached(model: Path, options: onnxruntime.SessionOptions) -> onnxruntime.InferenceSession | None:
@@ -153,7 +211,7 @@ def _open_cached(model: Path, options: onnxruntime.SessionOptions) -> onnxruntim
 
     def optimise(target: Path) -> onnxruntime.InferenceSession:
         options.optimized_model_filepath = str(target)
-        return _create(model, options)
+        return _create(model, options, [(CPU, {})])
 
     found = entry.get()
     LOG.info("%s: %s", model, f"its optimised graph is cached as {found}" if found else "optimising its graph, once")
@@ -161,7 +219,7 @@ def _open_cached(model: Path, options: onnxruntime.SessionOptions) -> onnxruntim
         if found is None:
             return entry.put(optimise)
         options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
-        return _create(found, options)
+        return _create(found, options, [(CPU, {})])
     except Exception:  # a damaged model or a full disk: opening the model itself raises the error, if it is the model's
         LOG.info("%s: the cache cannot be used", model, exc_info=LOG.isEnabledFor(logging.DEBUG))
         if found is not None:
@@ -174,7 +232,7 @@ def _open_cached(model: Path, options: onnxruntime.SessionOptions) -> onnxruntim
 
 def run_session(
     session: onnxruntime.InferenceSession,
-    feeds: dict[str, np.ndarray],
+    feeds: Mapping[str, np.ndarray],
     outputs: Sequence[str] | None = None,
     limit_s: float | None = None,
 ) -> dict[str, np.ndarray]:
@@ -184,17 +242,57 @@ def run_session(
     that does not end cannot be.
     Raises InputError if an input is missing, the graph cannot run on these feeds, or it exceeds the limit.
     """
+    wanted = _inputs_of(session, feeds)
+    names = [entry.name for entry in session.get_outputs()] if outputs is None else list(outputs)
+    with _limited(limit_s) as options:
+        found = session.run(names, wanted, options)
+    return dict(zip(names, found, strict=True))
+
+
+def run_on_device(
+    session: onnxruntime.InferenceSession,
+    feeds: Mapping[str, Any],
+    outputs: Sequence[str],
+    limit_s: float | None,
+    keep: Collection[str],
+    memory: str,
+) -> dict[str, Any]:
+    """`run_session` with the outputs in `keep` left in the memory of the session's provider (`Provider.memory`).
+
+    They are OrtValues, which feed another session on the same device without a copy; other outputs are arrays.
+    """
+    wanted = _inputs_of(session, feeds)
+    binding = session.io_binding()
+    with _limited(limit_s) as options:
+        for name, value in wanted.items():
+            if isinstance(value, np.ndarray):
+                binding.bind_cpu_input(name, np.ascontiguousarray(value))
+            else:
+                binding.bind_ortvalue_input(name, value)
+        for name in outputs:
+            binding.bind_output(name, memory if name in keep else "cpu")
+        session.run_with_iobinding(binding, options)
+        found = dict(zip(outputs, binding.get_outputs(), strict=True))
+        return {name: value if name in keep else value.numpy() for name, value in found.items()}
+
+
+def _inputs_of(session: onnxruntime.InferenceSession, feeds: Mapping[str, Any]) -> dict[str, Any]:
+    """The feeds that are inputs of the graph; raises InputError if one is missing."""
     missing = [entry.name for entry in session.get_inputs() if entry.name not in feeds]
     if missing:
         raise InputError(f"the graph needs the input {missing[0]}, which is not given; export the model again")
-    wanted = {entry.name: feeds[entry.name] for entry in session.get_inputs()}
-    names = [entry.name for entry in session.get_outputs()] if outputs is None else list(outputs)
+    return {entry.name: feeds[entry.name] for entry in session.get_inputs()}
+
+
+@contextmanager
+def _limited(limit_s: float | None) -> Iterator[onnxruntime.RunOptions]:
+    """The options of a run that is stopped after the limit; its errors become InputErrors."""
     options = onnxruntime.RunOptions()
     options.log_severity_level = FATAL_ONLY
     ended = threading.Event()
     watchdog = _watchdog(options, ended, limit_s)
     try:
-        found = session.run(names, wanted, options)
+        yield options
     except Exception as error:  # of many kinds, as above; also out of memory
         if ended.is_set():
             late = f"the graph did not end within {limit_s:g} s and was stopped"
@@ -203,7 +301,6 @@ def run_session(
     finally:
         if watchdog is not None:
             watchdog.cancel()
-    return dict(zip(names, found, strict=True))
 
 
 def run_limit_s(pixels: int) -> float:

@@ -15,7 +15,8 @@ from ..inference.bundled_model import bundled_model
 from ..inference.inputs import Inputs, Request, read_inputs
 from ..inference.model_files import ModelFiles, read_model
 from ..inference.predictor import Predictor
-from ..inference.session import CPU, provider_name
+from ..inference.providers import AUTO, CPU, candidates
+from ..inference.session import DEFAULT, SessionConfig
 from ..splats.filtering import FilterOptions
 from ..system.progress import CALLBACK, ProgressCallback, reporting_to, working
 from ..views.exposure import compensate_exposure
@@ -50,6 +51,7 @@ def reconstruct(
     offset: str | None = None,
     exposure: str = ExposureMode.AUTO,
     provider: str = CPU,
+    session: SessionConfig = DEFAULT,
     filters: FilterOptions | None = None,
     on_inputs: Callable[[Inputs], None] | None = None,
     on_step: Callable[[int, float], bool] | None = None,
@@ -62,7 +64,8 @@ def reconstruct(
     cameras: a file or folder of any known format (`camera_format` where its content does not tell it); `Camera`s, one
     for each array, or whose names are those of the image files; "estimate"; or None for the cameras beside the images,
     estimated where there are none (`focal`: focal length in pixels such as "1375", or on 35 mm film such as "26mm").
-    model: a .onnx file or staged folder instead of the bundled model. provider: the ONNX Runtime execution provider.
+    model: a .onnx file or staged folder instead of the bundled model, or the name of one (`find_model`).
+    provider: the ONNX Runtime execution provider, or "auto". session: its device and options, and threads.
     select: images to use, as names or numbers ("0-3", "0:8:2"). views: how many of them, by the best baselines, or
     "all"; by default as many as the quality says, or all that `select` names.
     quality: "fast", "standard" or "high" (`quality.PRESETS`); by default standard with the bundled model, and with
@@ -80,7 +83,7 @@ def reconstruct(
     Raises InputError for invalid or unreadable inputs.
     """
     _check_depth_bounds(near, far)
-    provider_name(provider)
+    candidates(provider)
     parse_offset(offset or "auto")
     mode = parse_exposure_mode(exposure)
     with reporting_to(progress or CALLBACK.get()):
@@ -106,9 +109,12 @@ def reconstruct(
             on_inputs(inputs)
         prepared = time.perf_counter()
         with working("loading the model"):
-            predictor = Predictor(files, provider)
+            predictor = Predictor(files, provider, session)
         loaded = time.perf_counter()
-        LOG.info("loaded %s on %s in %.2f s", files.path, provider, predictor.load_seconds)
+        ran_on = predictor.provider.name
+        if provider.lower() == AUTO:
+            inputs.notes.append(f"ran on {ran_on}")
+        LOG.info("loaded %s on %s in %.2f s", files.path, ran_on, predictor.load_seconds)
         with working("finding near and far"):
             span = predictor.depth_range(inputs.views, near, far)
         with working("comparing exposures"):

@@ -174,7 +174,7 @@ def test_compiled_code_is_kept_in_our_cache(tmp_path):
 
 @pytest.mark.parametrize(
     "module",
-    ["runtime.inference.session", "runtime.inference.openvino", "export.graph.cleanup", "tools.benchmark.components"],
+    ["runtime.inference.session", "runtime.inference.providers", "export.graph.cleanup", "tools.benchmark.components"],
 )
 def test_telemetry_is_off_before_onnx_runtime_is_imported(module):
     code = (

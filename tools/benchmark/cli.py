@@ -13,8 +13,19 @@ import typer
 from rich.console import Console
 
 from ...runtime.cli.input_files import model_files
-from ...runtime.cli.options import Config, Json, Overwrite, Quiet, Verbose
+from ...runtime.cli.options import (
+    EXECUTION,
+    Config,
+    Device,
+    Json,
+    Overwrite,
+    ProviderOption,
+    Quiet,
+    Threads,
+    Verbose,
+)
 from ...runtime.cli.outputs import STANDARD_OUTPUT, command
+from ...runtime.cli.session_options import session_config
 from ...runtime.cli.terminal import literal, run, say, warn
 from ...runtime.errors import InputError
 from ...runtime.images.sizes import parse_size
@@ -39,11 +50,27 @@ def bench(
     sizes: Annotated[
         str | None, typer.Option(help="Sizes, such as 256x256,256x448, instead of each model's own.")
     ] = None,
-    providers: Annotated[str, typer.Option(help="Execution providers, such as CPU,CUDA.")] = "CPU",
-    repeats: Annotated[int, typer.Option(help="Rounds.", min=1)] = 7,
-    threads: Annotated[
-        int | None, typer.Option(help="Threads of each candidate, instead of one for each core.", min=1)
+    provider: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Execution provider, or auto, as for `idesplat infer`; repeat it to compare several. CPU by default.",
+            metavar="auto|NAME",
+            show_default=False,
+            rich_help_panel=EXECUTION,
+        ),
     ] = None,
+    provider_option: ProviderOption = None,
+    device: Device = None,
+    threads: Threads = None,
+    list_providers: Annotated[
+        bool,
+        typer.Option(
+            "--list-providers",
+            help="List the execution providers, which are installed, and what was tried of each.",
+            rich_help_panel=EXECUTION,
+        ),
+    ] = False,
+    repeats: Annotated[int, typer.Option(help="Rounds.", min=1)] = 7,
     eager: Annotated[bool, typer.Option(help="Run the same networks in eager PyTorch, where it is installed.")] = True,
     training: Annotated[
         bool, typer.Option("--training", help="Measure training instead: scenes per second of two configurations.")
@@ -58,6 +85,11 @@ def bench(
     quiet: Quiet = False,
 ) -> None:
     """Measure time and memory of exported models, each in a fresh process; Ctrl-C keeps finished workloads."""
+    if list_providers:
+        from .report import print_providers
+
+        print_providers()
+        return
     if training:
         from .training import benchmark_training, print_training
 
@@ -71,7 +103,10 @@ def bench(
 
     _check_json(json_path, [*(models or []), *([compare] if compare else [])])
     before = read_rows(compare) if compare is not None else []
-    settings = settings_for(threads, repeats, eager)
+    providers = provider or ["CPU"]
+    if len(providers) > 1 and (device or provider_option):
+        raise InputError("--device and --provider-option: expected one --provider, whose they are; got several")
+    settings = settings_for(session_config(threads, device, provider_option), repeats, eager)
     counts, shapes = _counts(views), _sizes(sizes)
     rows: list[Row] = []
     interrupted = False
@@ -82,7 +117,7 @@ def bench(
                 settings,
                 view_counts=counts,
                 sizes=shapes,
-                providers=providers.split(","),
+                providers=providers,
                 on_status=status,
             ):
                 rows += measured

@@ -1,4 +1,4 @@
-"""Reports of a benchmark: rows, tables, the JSON file, and the comparison with an earlier one."""
+"""Reports of a benchmark: rows, tables, the JSON file, the comparison with an earlier one; the execution providers."""
 
 import json
 from collections.abc import Sequence
@@ -7,12 +7,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnxruntime
 from rich.console import Console
 from rich.table import Table
 
 from ...runtime.cli.outputs import write_json
 from ...runtime.cli.terminal import literal
 from ...runtime.errors import InputError
+from ...runtime.inference.providers import (
+    CPU,
+    Provider,
+    all_providers,
+    device_type,
+    devices_of,
+    is_built_in,
+    is_installed,
+)
 from ...runtime.system.files import read_bytes
 
 VERSION = 2  # of the JSON's layout; version 1 had no such field
@@ -86,7 +96,7 @@ def print_rows(rows: Sequence[Row]) -> None:
     for row in rows:
         names = (literal(row.model), row.precision, row.provider, str(row.views), f"{row.height}x{row.width}")
         table.add_row(*names, *_numbers(row))
-    _print(table)
+    print_table(table)
     shares = Table()
     for name in ("model", "views", "size", "operators", "stages"):
         shares.add_column(name, no_wrap=name == "model")
@@ -95,7 +105,7 @@ def print_rows(rows: Sequence[Row]) -> None:
             size = f"{row.height}x{row.width}"
             shares.add_row(literal(row.model), str(row.views), size, _shares(row.operators), _shares(row.stages))
     if shares.rows:
-        _print(shares)
+        print_table(shares)
 
 
 def write_rows(path: Path, machine: dict[str, Any], rows: Sequence[Row]) -> None:
@@ -139,7 +149,7 @@ def compare(rows: Sequence[Row], before: Sequence[Row]) -> list[str]:
         memory = f"{row.peak_bytes / old.peak_bytes:.2f}" if row.peak_bytes and old.peak_bytes else ""
         table.add_row(literal(row.name), f"{time:.2f}", memory, ", ".join(verdicts))
         worse += [f"{row.name}: {verdict}" for verdict in verdicts]
-    _print(table)
+    print_table(table)
     return worse
 
 
@@ -177,7 +187,35 @@ def _shares(shares: dict[str, float]) -> str:
     return ", ".join(f"{name} {share:.0%}" for name, share in list(shares.items())[:SHOWN])
 
 
-def _print(table: Table) -> None:
+def print_providers() -> None:
+    """Print every known provider, the package that has it, what of it is here, and what of it was tried."""
+    table = Table(title=f"execution providers of ONNX Runtime {onnxruntime.__version__}", title_justify="left")
+    for name in ("--provider", "package", "runs on", "here", "tried by the project"):
+        table.add_column(name, no_wrap=name in ("--provider", "package"))
+    for provider in all_providers():
+        cells = (provider.name, provider.package, provider.hardware, _state(provider), provider.tried)
+        table.add_row(*map(literal, cells))
+    print_table(table)
+
+
+def _state(provider: Provider) -> str:
+    """Whether a provider is installed, and the devices that it finds."""
+    if not is_installed(provider):
+        return "not installed"
+    if provider.ep_name == CPU:
+        return "yes"
+    if is_built_in(provider):
+        return "installed"
+    try:
+        devices = devices_of(provider)
+    except InputError as error:
+        return f"{provider.version}: {error}"
+    found = ", ".join(f"{index} {device_type(device)}" for index, device in enumerate(devices)) or "none"
+    return f"{provider.version}, devices: {found}"
+
+
+def print_table(table: Table) -> None:
+    """Print a table, wide where the output is no terminal."""
     console = Console()
     if not console.is_terminal:
         console = Console(width=WIDTH)

@@ -5,7 +5,7 @@ import platform
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,7 +15,7 @@ import numpy as np
 
 from ...runtime.errors import InputError
 from ...runtime.inference.bundled_model import bundled_model
-from ...runtime.inference.session import usable_cores
+from ...runtime.inference.session import SessionConfig, usable_cores
 from .report import Row
 from .worker import Failed, Worker, Workload, analyse, describe, eager, exported, gemm
 
@@ -31,9 +31,14 @@ OnStatus = Callable[[str], None]
 class Settings:
     """Settings of all candidates. eager: whether the same networks also run in PyTorch."""
 
-    threads: int
+    session: SessionConfig
     repeats: int
     eager: bool
+
+    @property
+    def threads(self) -> int:
+        """The threads of each candidate."""
+        return self.session.threads or usable_cores()
 
 
 @dataclass(frozen=True)
@@ -45,9 +50,10 @@ class ModelCandidate:
     metadata: dict[str, Any]
 
 
-def settings_for(threads: int | None, repeats: int, eager: bool) -> Settings:
+def settings_for(session: SessionConfig, repeats: int, eager: bool) -> Settings:
     """Settings with a thread for each core by default, and eager PyTorch only where it is installed."""
-    return Settings(threads or usable_cores(), repeats, eager and find_spec("torch") is not None)
+    session = replace(session, threads=session.threads or usable_cores())
+    return Settings(session, repeats, eager and find_spec("torch") is not None)
 
 
 def benchmark(
@@ -172,9 +178,10 @@ def _run_interleaved(
     on_status: OnStatus,
 ) -> None:
     """Run the candidates interleaved, round by round, and record the measurements in the rows."""
-    prepared: list[tuple] = [(row, eager, row.preset) for row in networks]
+    prepared: list[tuple] = [(row, eager, row.preset, settings.threads) for row in networks]
     prepared += [
-        (row, exported, candidate.model, candidate.provider) for row, candidate in zip(rows, candidates, strict=True)
+        (row, exported, candidate.model, candidate.provider, settings.session)
+        for row, candidate in zip(rows, candidates, strict=True)
     ]
     with ExitStack() as stack:
         reference = stack.enter_context(Worker(gemm))
@@ -182,7 +189,8 @@ def _run_interleaved(
         for row, *arguments in prepared:
             on_status(f"{row.name}: opening")
             with _noting_failure(row):
-                worker = stack.enter_context(Worker(*arguments, settings.threads, workload))
+                worker = stack.enter_context(Worker(*arguments, workload))
+                row.provider = worker.about.get("provider", row.provider)
                 running.append((row, worker))
         for turn in range(settings.repeats):
             first = turn % max(len(running), 1)  # no candidate always runs after the same one
@@ -232,7 +240,7 @@ def _note_depth_errors(running: Sequence[tuple[Row, Worker]]) -> None:
 def _add_shares(row: Row, candidate: ModelCandidate, workload: Workload, settings: Settings) -> None:
     """Profile a model: the shares of its time by operator and stage, and its FLOP."""
     try:
-        with Worker(analyse, candidate.model, candidate.provider, settings.threads, workload) as worker:
+        with Worker(analyse, candidate.model, row.provider, settings.session, workload) as worker:
             row.operators, row.stages, row.flop = (worker.about[part] for part in ("operators", "stages", "flop"))
     except Failed as problem:
         row.problem = f"could not be profiled ({problem})"

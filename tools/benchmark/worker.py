@@ -7,15 +7,18 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from math import prod
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from ..processes import safe_path
+
+if TYPE_CHECKING:
+    from ...runtime.inference.session import SessionConfig
 
 # Side of the GEMM reference's square matrices, large enough to reach the machine's peak rate.
 GEMM_SIDE = 2048
@@ -155,13 +158,12 @@ def describe(model: Path) -> Prepared:
     return asdict(read_model(model).metadata), dict
 
 
-def exported(model: Path, provider: str, threads: int, workload: Workload) -> Prepared:
-    """An exported model; `about` holds the seconds to open it, and its predicted depth."""
+def exported(model: Path, provider: str, config: "SessionConfig", workload: Workload) -> Prepared:
+    """An exported model; `about` holds the provider, the seconds to open it, and its predicted depth."""
     from ...runtime.inference.predictor import Predictor
-    from ...runtime.inference.session import SessionConfig
 
     started = time.perf_counter()
-    predictor = Predictor(model, provider, SessionConfig(threads))
+    predictor = Predictor(model, provider, config)
     load_seconds = time.perf_counter() - started
     arrays = example_arrays(workload, predictor.metadata.near, predictor.metadata.far)
 
@@ -169,7 +171,7 @@ def exported(model: Path, provider: str, threads: int, workload: Workload) -> Pr
         predictor.predict_arrays(*arrays)
 
     depth = predictor.predict_arrays(*arrays).depth
-    return {"load_seconds": load_seconds, "depth": depth}, run
+    return {"provider": predictor.provider.name, "load_seconds": load_seconds, "depth": depth}, run
 
 
 def eager(preset: str, threads: int, workload: Workload) -> Prepared:
@@ -194,14 +196,14 @@ def eager(preset: str, threads: int, workload: Workload) -> Prepared:
     return about, run
 
 
-def analyse(model: Path, provider: str, threads: int, workload: Workload) -> Prepared:
+def analyse(model: Path, provider: str, config: "SessionConfig", workload: Workload) -> Prepared:
     """Profile a model; `about` holds the result, and there is nothing to run.
 
     operators, stages: shares of the time, by name. flop: of its matmuls and convolutions.
     """
-    from ...runtime.inference.session import CPU
+    from ...runtime.inference.providers import CPU
 
-    kernels = _profile(model, provider, threads, workload, optimise=True)
+    kernels = _profile(model, provider, config, workload, optimise=True)
     operators: Counter[str] = Counter()
     stages: Counter[str] = Counter()
     for kernel in kernels:
@@ -210,7 +212,7 @@ def analyse(model: Path, provider: str, threads: int, workload: Workload) -> Pre
         operators[kernel["args"]["op_name"]] += kernel["dur"]
         scope = kernel["name"].split("/")
         stages[scope[1] if len(scope) > 2 else "other"] += kernel["dur"]
-    plain = _profile(model, CPU, threads, workload, optimise=False)
+    plain = _profile(model, CPU, replace(config, device=None, provider_options={}), workload, optimise=False)
     flop = sum(flop_of(kernel["args"]) for kernel in plain)
     return {"operators": _shares(operators), "stages": _shares(stages), "flop": flop}, dict
 
@@ -228,14 +230,15 @@ def example_arrays(workload: Workload, near: float, far: float) -> tuple[np.ndar
     return np.ascontiguousarray(images), extrinsics, np.tile(K, (views, 1, 1)), *ranges
 
 
-def _profile(model: Path, provider: str, threads: int, workload: Workload, optimise: bool) -> list[dict[str, Any]]:
+def _profile(
+    model: Path, provider: str, config: "SessionConfig", workload: Workload, optimise: bool
+) -> list[dict[str, Any]]:
     """ONNX Runtime's profile of every operator of a run; of an optimised graph, of its second run."""
     from ...runtime.inference.predictor import Predictor
-    from ...runtime.inference.session import SessionConfig
     from ...runtime.system.files import scratch_folder
 
     with scratch_folder() as folder:
-        predictor = Predictor(model, provider, SessionConfig(threads, folder / "profile", optimise))
+        predictor = Predictor(model, provider, replace(config, profile=folder / "profile", optimise=optimise))
         arrays = example_arrays(workload, predictor.metadata.near, predictor.metadata.far)
         for _ in range(TIMES_PROFILED if optimise else 1):
             predictor.predict_arrays(*arrays)

@@ -10,17 +10,22 @@ from ...runtime.cli.input_files import camera_files, model_files
 from ...runtime.cli.options import (
     CAMERAS_HELP,
     Config,
+    Device,
     Far,
     Model,
     Near,
     Overwrite,
+    Provider,
+    ProviderOption,
     QualityOption,
     Quiet,
     Refine,
     Size,
+    Threads,
     Verbose,
 )
 from ...runtime.cli.outputs import command
+from ...runtime.cli.session_options import session_config
 from ...runtime.cli.terminal import run, say, warn
 from ...runtime.errors import InputError
 from ...runtime.images.naming import name_files
@@ -33,6 +38,8 @@ from .defaults import CONTEXT_VIEWS, HELD_OUT_SCENES, HOLD_OUT_EVERY, VIEW_COUNT
 if TYPE_CHECKING:  # nothing heavy is loaded before there is something to evaluate
     import numpy as np
 
+    from ...runtime.inference.predictor import Predictor
+    from ...runtime.inference.session import SessionConfig
     from .evaluate import Evaluation
     from .novel_views import Result
 
@@ -51,6 +58,10 @@ def scene(
     cameras: Annotated[Path, typer.Option("--cameras", "-c", help=CAMERAS_HELP, show_default=False)],
     out: Out,
     model: Model = None,
+    provider: Provider = "CPU",
+    provider_option: ProviderOption = None,
+    device: Device = None,
+    threads: Threads = None,
     context: Annotated[list[str] | None, typer.Option(help="An image to infer from; give two or more.")] = None,
     target: Annotated[list[str] | None, typer.Option(help="An image to hold out; give one or more.")] = None,
     views: Annotated[
@@ -78,11 +89,12 @@ def scene(
 
     found = find_images([images])
     known = read_cameras(cameras, found)
+    session = session_config(threads, device, provider_option)
     _check_outputs(model, out, [*found, *camera_files(cameras)])
     result = evaluate(
         found,
         known,
-        model,
+        _open(model, provider, session),
         context=context or [],
         targets=target or [],
         views=views,
@@ -107,6 +119,10 @@ def chunks(
     index: Annotated[Path, typer.Option(help="The published evaluation index (.json).", show_default=False)],
     out: Out,
     model: Model = None,
+    provider: Provider = "CPU",
+    provider_option: ProviderOption = None,
+    device: Device = None,
+    threads: Threads = None,
     near: Near = None,
     far: Far = None,
     overwrite: Overwrite = False,
@@ -120,8 +136,16 @@ def chunks(
     from .report import print_means
 
     entries = read_index(index)
+    session = session_config(threads, device, provider_option)
     _check_outputs(model, out, [index, *find_chunks(folder)])
-    result = evaluate_chunks(folder, index, model, near=near, far=far, on_scene=StripWriter(out, SCENES_WITH_STRIPS))
+    result = evaluate_chunks(
+        folder,
+        index,
+        _open(model, provider, session),
+        near=near,
+        far=far,
+        on_scene=StripWriter(out, SCENES_WITH_STRIPS),
+    )
     for key, reason in result.skipped.items():
         say(f"skipped {key}: {reason}")
     print_means(result.mean, f"{len(result.scenes)} of the index's {len(entries)} scenes, {_by(result.size)}")
@@ -135,6 +159,10 @@ def chunks(
 def synthetic(
     out: Out,
     model: Model = None,
+    provider: Provider = "CPU",
+    provider_option: ProviderOption = None,
+    device: Device = None,
+    threads: Threads = None,
     scenes: Annotated[
         int, typer.Option(help="How many of the held-out scenes.", min=1, max=HELD_OUT_SCENES)
     ] = HELD_OUT_SCENES,
@@ -153,9 +181,10 @@ def synthetic(
     from .evaluate import evaluate_synthetic
     from .report import print_means
 
+    session = session_config(threads, device, provider_option)
     _check_outputs(model, out, [])
     result = evaluate_synthetic(
-        model,
+        _open(model, provider, session),
         scenes=scenes,
         views=views,
         pool_views=pool_views,
@@ -182,6 +211,10 @@ def captures(
     quality: QualityOption = None,
     refine: Refine = None,
     model: Model = None,
+    provider: Provider = "CPU",
+    provider_option: ProviderOption = None,
+    device: Device = None,
+    threads: Threads = None,
     size: Size = None,
     overwrite: Overwrite = False,
     config: Config = None,
@@ -195,10 +228,11 @@ def captures(
     from .evaluate import evaluate_captures
 
     counts = parse_view_counts(views)
+    session = session_config(threads, device, provider_option)
     _check_outputs(model, out, [])
     result = evaluate_captures(
         checkouts,
-        model,
+        _open(model, provider, session),
         captures=capture or [],
         view_counts=counts,
         quality=quality,
@@ -233,6 +267,13 @@ class StripWriter:
             for name, strip in zip(name_files(list(strips)), strips.values(), strict=True):
                 save_png(strip_file(self.folder, result.name, name), strip)
         self.scenes += 1
+
+
+def _open(model: Path | None, provider: str, session: "SessionConfig") -> "Predictor":
+    """The model on its execution provider; the bundled model where none is given."""
+    from ...runtime.inference.predictor import Predictor
+
+    return Predictor(model or bundled_model(), provider, session)
 
 
 def _by(size: tuple[int, int]) -> str:

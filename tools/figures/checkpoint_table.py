@@ -26,7 +26,8 @@ from ...model.registry import PRESETS, build, family_of
 from ...runtime.cli.terminal import run, say
 from ...runtime.errors import InputError
 from ...runtime.inference.normalization import SceneNormalization
-from ...runtime.inference.session import CPU
+from ...runtime.inference.providers import CPU
+from ...runtime.inference.session import SessionConfig
 from ...runtime.system.files import scratch_folder
 from ..benchmark.runner import thread_environment
 from ..benchmark.worker import Failed, Prepared, Worker, Workload, example_arrays, exported
@@ -173,7 +174,7 @@ def exporting(checkpoint: Path, preset: str, model: Path) -> Prepared:
 
 def running(model: Path, workload: Workload) -> Prepared:
     """The exported model; `about` holds its predicted depth, and a run gives its CPU seconds."""
-    about, run = exported(model, CPU, 1, workload)
+    about, run = exported(model, CPU, SessionConfig(1), workload)
     return about, _timed(run)
 
 

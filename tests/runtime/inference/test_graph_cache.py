@@ -54,9 +54,9 @@ def opened_paths(monkeypatch) -> list[str]:
     """The files from which ONNX Runtime opens sessions from now on."""
     paths, create = [], session._create
 
-    def record(model, options, provider=session.CPU):
+    def record(model, options, providers):
         paths.append(str(model))
-        return create(model, options, provider)
+        return create(model, options, providers)
 
     monkeypatch.setattr(session, "_create", record)
     return paths
@@ -170,7 +170,7 @@ def test_a_model_that_cannot_be_loaded_leaves_nothing(cache, tmp_path):
 @pytest.mark.parametrize(
     ("where", "name", "value"),
     [
-        (graph_cache, "_cpu", lambda: "another CPU"),
+        (graph_cache, "describe_cpu", lambda: "another CPU"),
         (onnxruntime, "__version__", "99.0"),
         (graph_cache, "LAYOUT", 2),
     ],

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from conftest import SMALL, SMALL_PRESET, run_command
 from idesplat.runtime.errors import InputError
-from idesplat.runtime.inference.session import CPU, SessionConfig, open_session
+from idesplat.runtime.inference.providers import CPU
+from idesplat.runtime.inference.session import SessionConfig, open_session
 from idesplat.tools.benchmark import cli as bench
 from idesplat.tools.benchmark import runner, training
 from idesplat.tools.benchmark.report import Row, compare, read_rows, write_rows
