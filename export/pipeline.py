@@ -80,7 +80,7 @@ def export_checkpoint(
             staged = staged.resolve() if staged is not None and staged.is_symlink() else staged
             outputs.reads("the checkpoint", [checkpoint])
             _check_targets(outputs, out, staged)
-        _require_pytorch()
+        require_pytorch()
         from . import conversion
 
         _check_precision(precision)
@@ -109,7 +109,8 @@ def _os_errors_as_input_errors(remedy: str) -> Iterator[None]:
         raise InputError(f"cannot write the result ({error}); {remedy}") from None
 
 
-def _require_pytorch() -> None:
+def require_pytorch() -> None:
+    """Raise InputError where PyTorch or onnx are not installed."""
     if find_spec("torch") is None or find_spec("onnx") is None:
         raise InputError("exporting needs PyTorch and onnx, which are not installed; pip install 'idesplat[export]'")
 

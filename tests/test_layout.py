@@ -29,7 +29,7 @@ ORDERS = {
     "model": ("config", "common", "family", "idesplat", "depthsplat", "registry", "checkpoint"),
     "export": (
         *("existing_exports", "graph", "stages", "example_inputs", "precision", "tracing", "validation"),
-        *("conversion", "pipeline", "cli"),
+        *("conversion", "pipeline", "released", "cli"),
     ),
     "tools": ("processes", "synthetic", "training", "evaluation", "benchmark", "figures"),
 }
@@ -37,6 +37,7 @@ ORDERS = {
 # Modules that import others of ours inside functions: commands, for their start-up time, and these.
 LAZY = {
     "export.pipeline": "PyTorch and onnx are optional",
+    "export.released.pull": "PyTorch is optional",
     "runtime.rendering.rasterizer": "numba takes time to load",
     "tools.benchmark.components": "PyTorch is optional",
     "tools.benchmark.runner": "PyTorch is optional",

@@ -24,6 +24,8 @@ class SubCommand(NamedTuple):
 COMMANDS = {
     "infer": SubCommand(".infer", "infer", "Photographs to a 3D Gaussian splat, depth maps and rendered views."),
     "export": SubCommand("...export.cli", "export", "A checkpoint to ONNX, verified against PyTorch."),
+    "models": SubCommand(".models", "models", "List the models that --model takes by name."),
+    "pull": SubCommand("...export.released.cli", "pull", "Download a released model, and export it into the cache."),
     "view": SubCommand(".view", "view", "Look at a splat file in the browser."),
     "render": SubCommand(".render", "render", "A splat file to images or a video."),
     "refine": SubCommand(".refine", "refine", "Fit a splat file to the images of its scene."),

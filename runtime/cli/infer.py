@@ -187,9 +187,9 @@ def infer(
     `idesplat infer FOLDER` is enough: cameras are looked for beside the photographs, or else estimated.
     """
     from ..images.sizes import parse_size
-    from ..inference.bundled_model import bundled_model
     from ..inference.inputs import parse_views
     from ..inference.model_files import read_model
+    from ..inference.named_models import find_model
     from ..reconstruction.pipeline import reconstruct
     from ..splats.filtering import FilterOptions
     from ..splats.io import is_mesh
@@ -202,7 +202,7 @@ def infer(
     targets = Targets(
         out or _named_after(given), save_depth, depth_format, render, save_cameras, report, json_path, found
     )
-    model = model or bundled_model()
+    model = find_model(model)
     targets.announce(model)
     filters = FilterOptions(
         min_opacity=min_opacity,

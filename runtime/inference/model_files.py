@@ -12,6 +12,7 @@ from ..images.sizes import describe_size_rule, is_valid_size
 from ..system.files import open_regular
 from .metadata import INPUTS, ModelMetadata, StageFile, expected_outputs, read_manifest, read_metadata
 from .metadata_fields import shown
+from .named_models import find_model
 from .onnx_metadata import read_properties
 
 FUSED = "model"  # the name of the one stage of a model in one file
@@ -82,11 +83,11 @@ class ModelFiles:
 def read_model(path: Path | str) -> ModelFiles:
     """The files and metadata of an exported model; no graph is loaded.
 
-    path: a `.onnx` of this project, or a folder that `idesplat-export --staged` wrote.
+    path: a `.onnx` of this project, a folder that `idesplat-export --staged` wrote, or a name (`find_model`).
     Raises InputError if there is no such model, a file is not one of ours or damaged, or refers to weights outside its
     folder.
     """
-    path = Path(path)
+    path = find_model(path)
     if not path.exists():
         raise InputError(f"{path}: no such model; give a .onnx file or staged folder made by idesplat-export")
     if path.is_dir():

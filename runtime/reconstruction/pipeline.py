@@ -11,9 +11,9 @@ import numpy as np
 from ..cameras.camera import Camera
 from ..cameras.formats import CameraFormat
 from ..errors import InputError
-from ..inference.bundled_model import bundled_model
 from ..inference.inputs import Inputs, Request, read_inputs
 from ..inference.model_files import ModelFiles, read_model
+from ..inference.named_models import find_model
 from ..inference.predictor import Predictor
 from ..inference.providers import AUTO, CPU, candidates
 from ..inference.session import DEFAULT, SessionConfig
@@ -87,7 +87,7 @@ def reconstruct(
     parse_offset(offset or "auto")
     mode = parse_exposure_mode(exposure)
     with reporting_to(progress or CALLBACK.get()):
-        files = model if isinstance(model, ModelFiles) else read_model(model or bundled_model())
+        files = model if isinstance(model, ModelFiles) else read_model(find_model(model))
         plan = make_plan(quality, files, refine, filters or FilterOptions(), max_gaussians)
         started = time.perf_counter()
         request = Request(

@@ -44,7 +44,7 @@ STEPS_OF_A_ROUND = 3  # of training
 @command("idesplat bench")
 def bench(
     models: Annotated[
-        list[Path] | None, typer.Argument(help="Models (.onnx or staged folders) instead of the bundled one.")
+        list[Path] | None, typer.Argument(help="Models (.onnx, staged folders or names) instead of the bundled one.")
     ] = None,
     views: Annotated[str, typer.Option(help="Numbers of views, such as 2,4.")] = "2",
     sizes: Annotated[
@@ -97,11 +97,13 @@ def bench(
             found = benchmark_training(repeats, STEPS_OF_A_ROUND, status)
         print_training(found)
         return
+    from ...runtime.inference.named_models import find_model
     from .report import compare as compare_rows
     from .report import print_rows, read_rows, write_rows
     from .runner import benchmark, describe_machine, settings_for
 
-    _check_json(json_path, [*(models or []), *([compare] if compare else [])])
+    paths = [find_model(model) for model in models] if models else [find_model()]
+    _check_json(json_path, [*paths, *([compare] if compare else [])])
     before = read_rows(compare) if compare is not None else []
     providers = provider or ["CPU"]
     if len(providers) > 1 and (device or provider_option):
@@ -113,7 +115,7 @@ def bench(
     try:
         with _status() as status:
             for measured in benchmark(
-                models or [],
+                paths,
                 settings,
                 view_counts=counts,
                 sizes=shapes,

@@ -30,7 +30,7 @@ from ...runtime.cli.terminal import run, say, warn
 from ...runtime.errors import InputError
 from ...runtime.images.naming import name_files
 from ...runtime.images.sizes import parse_size
-from ...runtime.inference.bundled_model import bundled_model
+from ...runtime.inference.named_models import find_model
 from ...runtime.system.output_names import IMAGE, RESULTS, strip_file
 from ...runtime.system.outputs import outputs
 from .defaults import CONTEXT_VIEWS, HELD_OUT_SCENES, HOLD_OUT_EVERY, VIEW_COUNTS
@@ -273,7 +273,7 @@ def _open(model: Path | None, provider: str, session: "SessionConfig") -> "Predi
     """The model on its execution provider; the bundled model where none is given."""
     from ...runtime.inference.predictor import Predictor
 
-    return Predictor(model or bundled_model(), provider, session)
+    return Predictor(find_model(model), provider, session)
 
 
 def _by(size: tuple[int, int]) -> str:
@@ -286,7 +286,7 @@ def _check_outputs(model: Path | None, out: Path, data: Sequence[Path]) -> None:
     Strips are named after scenes, which may not be known yet, so every .png in the folder counts as one to be replaced.
     """
     files = outputs()
-    files.reads("the model", model_files(model or bundled_model()))
+    files.reads("the model", model_files(find_model(model)))
     files.reads("data", data)
     files.writes_into("--out", out)
     files.writes("--out", [out / RESULTS, *out.glob(f"*{IMAGE}")])

@@ -16,8 +16,8 @@ from ...runtime.cameras.camera import Camera
 from ...runtime.cameras.io import read_cameras
 from ...runtime.errors import InputError
 from ...runtime.images.finding import find_images
-from ...runtime.inference.bundled_model import bundled_model
 from ...runtime.inference.metadata import ModelMetadata
+from ...runtime.inference.named_models import find_model
 from ...runtime.inference.predictor import Predictor
 from ...runtime.reconstruction.quality import Quality
 from ...runtime.reconstruction.steps import make_plan
@@ -224,7 +224,7 @@ def evaluate_captures(
 
 
 def _opened(model: Model) -> Predictor:
-    return Predictor(model or bundled_model()) if model is None or isinstance(model, Path | str) else model
+    return model if isinstance(model, Predictor) else Predictor(find_model(model))
 
 
 def _load_metrics() -> tuple[dict[str, PerceptualMetric], list[str]]:

@@ -1,0 +1,1 @@
+"""Released checkpoints, downloaded from their authors and exported into the cache."""

@@ -1,0 +1,122 @@
+"""The file of a released checkpoint: downloaded from the hub where its authors publish it, or from a local folder."""
+
+import os
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from ...model.checkpoint import file_sha256
+from ...runtime.errors import InputError
+from ...runtime.inference.known_models import REVISION, KnownModel
+from ...runtime.system.cache_folder import cache_folder
+from ...runtime.system.progress import CALLBACK, Progress, ProgressCallback
+
+SHA256_DIGITS = 64
+HIDDEN_DIGITS = 8  # of a hash in messages
+
+
+def fetch_checkpoint(model: KnownModel, source: Path | None = None, revision: str | None = None) -> Path:
+    """The path of a released checkpoint whose SHA-256 was checked.
+
+    source: a folder that has the file, or the file, instead of a download. revision: a commit or branch of the
+    repository. A download goes to the cache folder, resumes where an earlier one ended, and is not repeated.
+    Raises InputError if the file cannot be had, or is not the released one.
+    """
+    if source is not None:
+        path = source / model.file if source.is_dir() else source
+        if not path.is_file():
+            raise InputError(f"{path}: no such file; give the folder that has {model.file}")
+        _check(path, model.sha256_prefix, "copy it again")
+        return path
+    path = _download(model, revision or REVISION)
+    # The hub's cache names a file after the hash that the hub states, which is the SHA-256 of large files.
+    stated = path.resolve().name
+    expected = model.sha256_prefix or (stated if len(stated) == SHA256_DIGITS else "")
+    try:
+        _check(path, expected, "it was removed; pull it again")
+    except InputError:
+        path.resolve().unlink()
+        path.unlink(missing_ok=True)
+        raise
+    return path
+
+
+def _check(path: Path, expected: str, remedy: str) -> None:
+    """Raise InputError unless the file's SHA-256 begins with the expected digits, which may be none."""
+    digest = file_sha256(path)
+    if not digest.startswith(expected):
+        raise InputError(
+            f"{path}: its SHA-256 begins with {digest[:HIDDEN_DIGITS]}, expected {expected[:HIDDEN_DIGITS]}: it is "
+            f"damaged, or not the released file; {remedy}"
+        )
+
+
+def _download(model: KnownModel, revision: str) -> Path:
+    """The file in the cache of the hub's library, in our cache folder."""
+    if find_spec("huggingface_hub") is None:
+        raise InputError(
+            "downloading needs huggingface_hub, which is not installed; pip install 'idesplat[hub]', or give a folder "
+            f"that has {model.file} as --from"
+        )
+    folder = cache_folder("downloads")
+    # Read when it is imported. It would send the versions of other packages along, and write to another cache.
+    os.environ.setdefault("HF_HUB_DISABLE_TELEMETRY", "1")
+    os.environ.setdefault("HF_XET_CACHE", str(folder / "xet"))
+    from huggingface_hub import hf_hub_download
+
+    endpoint = os.environ.get("HF_ENDPOINT") or None
+    try:
+        return Path(
+            hf_hub_download(
+                model.repository,
+                model.file,
+                revision=revision,
+                cache_dir=folder,
+                endpoint=endpoint,
+                library_name="idesplat",
+                library_version=version("idesplat"),
+                tqdm_class=_progress_bar(CALLBACK.get(), f"downloading {model.file}"),
+            )
+        )
+    except Exception as error:  # of the hub's library, of its HTTP library, of the system
+        reason = " ".join(str(error).split())
+        raise InputError(
+            f"{model.file} cannot be downloaded from {endpoint or 'huggingface.co'}/{model.repository} at {revision} "
+            f"({reason}); pull it again to resume, set HF_ENDPOINT to a mirror, or give a folder that has it as --from"
+        ) from None
+
+
+def _progress_bar(callback: ProgressCallback | None, description: str) -> Any:
+    """A class in the place of tqdm's that reports to the callback, whatever thread it is used in."""
+
+    class Bar:
+        def __init__(self, *, total: float | None = None, initial: float = 0, **options: Any) -> None:
+            self.total, self.n = total, initial
+            self._report()
+
+        def __enter__(self) -> Self:
+            return self
+
+        def __exit__(
+            self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        ) -> None:
+            self.close()
+
+        def update(self, count: float | None = 1) -> None:
+            self.n += count or 0
+            self._report()
+
+        def close(self) -> None:
+            self._report(ended=True)
+
+        def _report(self, ended: bool = False) -> None:
+            if callback is not None:
+                total = None if self.total is None else int(self.total)
+                callback(Progress(description, int(self.n), total, ended))
+
+        def __getattr__(self, name: str) -> Any:  # what else tqdm has changes the display alone
+            return lambda *args, **options: None
+
+    return Bar
