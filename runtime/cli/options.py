@@ -53,6 +53,7 @@ Model = Annotated[
     ),
 ]
 EXECUTION = "Where the model runs"
+MAX_THREADS = 1024
 Provider = Annotated[
     str,
     typer.Option(
@@ -82,7 +83,12 @@ Device = Annotated[
 ]
 Threads = Annotated[
     int | None,
-    typer.Option(help="CPU threads of the model, instead of one for each core.", min=1, rich_help_panel=EXECUTION),
+    typer.Option(
+        help="CPU threads of the model, instead of one for each core.",
+        min=1,
+        max=MAX_THREADS,
+        rich_help_panel=EXECUTION,
+    ),
 ]
 Size = Annotated[
     str | None,

@@ -18,9 +18,10 @@ from conftest import SMALL_PRESET, run_command
 from hypothesis import given
 from hypothesis import strategies as st
 from idesplat.export import cli as export
+from idesplat.export.released import cli as pull
 from idesplat.runtime.cameras.io import write_cameras
 from idesplat.runtime.cli import cameras as convert_cameras
-from idesplat.runtime.cli import convert, infer, render, view
+from idesplat.runtime.cli import convert, infer, models, render, view
 from idesplat.runtime.errors import printable
 from idesplat.runtime.inference.metadata import StageFile, write_manifest
 from idesplat.runtime.system.files import SCRATCH_PREFIX
@@ -99,6 +100,8 @@ COMMANDS = {
         ("last.ckpt",),
         20,
     ),
+    "models": Command(models.models, models.main, "--json out/m.json", (), 10),
+    "pull": Command(pull.pull, pull.main, "depthsplat-small-re10k --from last.ckpt", ("last.ckpt",), 10),
     "eval scene": Command(
         evaluate.scene,
         evaluate.main,
@@ -187,6 +190,7 @@ def place(good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, presets: 
     monkeypatch.setattr("idesplat.tools.evaluation.evaluate.fetch_checkout", no_network)
     monkeypatch.setattr(trainer.Trainer, "fit", lambda self, *arguments: None)  # training itself has tests of its own
     monkeypatch.setenv("IDESPLAT_RUN_LIMIT", "20")
+    monkeypatch.setenv("HF_ENDPOINT", "http://127.0.0.1:9")  # nobody listens there
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path.parent / f"{tmp_path.name}-cache"))
     threads = torch.get_num_threads()
     yield work
@@ -310,6 +314,7 @@ def test_the_good_calls_get_far(name: str, place: Path, capsys: pytest.CaptureFi
     late = {
         "export": "does not fit the network",
         "cameras estimate": "features match",
+        "pull": "expected cfeab6b1",
         "eval captures": "no network",
         "train": "expected at least",
     }

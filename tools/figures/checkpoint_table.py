@@ -35,11 +35,11 @@ from ..benchmark.worker import Failed, Prepared, Worker, Workload, example_array
 # Released files by preset; an asterisk stands for an unknown part of the name.
 RELEASED = {
     "idesplat-re10k": "idesplat-re10k-256x256-view2.ckpt",
-    "idesplat-acid": "idesplat-acid-*.ckpt",
+    "idesplat-acid": "idesplat-acid-256x256-view2.ckpt",
     "idesplat-dl3dv": "idesplat-dl3dv-256x448-randview2-6.ckpt",
     "depthsplat-small-re10k": "depthsplat-gs-small-re10k-256x256-view2-cfeab6b1.pth",
     "depthsplat-base-re10k": "depthsplat-gs-base-re10k-256x256-view2-ca7b6795.pth",
-    "depthsplat-large-re10k": "depthsplat-gs-large-re10k-256x256-view2-*.pth",
+    "depthsplat-large-re10k": "depthsplat-gs-large-re10k-256x256-view2-e0f0f27a.pth",
     "depthsplat-base-re10k-256x448": "depthsplat-gs-base-re10k-256x448-view2-fea94f65.pth",
     "depthsplat-base-dl3dv": "depthsplat-gs-base-dl3dv-256x448-randview2-6-02c7b19d.pth",
     "depthsplat-small-re10kdl3dv": "depthsplat-gs-small-re10kdl3dv-448x768-randview4-10-c08188db.pth",
