@@ -38,8 +38,6 @@ from .defaults import CONTEXT_VIEWS, HELD_OUT_SCENES, HOLD_OUT_EVERY, VIEW_COUNT
 if TYPE_CHECKING:  # nothing heavy is loaded before there is something to evaluate
     import numpy as np
 
-    from ...runtime.inference.predictor import Predictor
-    from ...runtime.inference.session import SessionConfig
     from .evaluate import Evaluation
     from .novel_views import Result
 
@@ -84,7 +82,7 @@ def scene(
         raise InputError("--views and --context: expected one of them; --context names the views that there are")
     from ...runtime.cameras.io import read_cameras
     from ...runtime.images.finding import find_images
-    from .evaluate import evaluate
+    from .evaluate import ModelOn, evaluate
     from .report import print_means, print_views
 
     found = find_images([images])
@@ -94,7 +92,7 @@ def scene(
     result = evaluate(
         found,
         known,
-        _open(model, provider, session),
+        ModelOn(find_model(model), provider, session),
         context=context or [],
         targets=target or [],
         views=views,
@@ -132,7 +130,7 @@ def chunks(
 ) -> None:
     """Evaluate on RealEstate10K, ACID or DL3DV as the papers do: pixelSplat's chunks, a published index of frames."""
     from .chunks import find_chunks, read_index
-    from .evaluate import evaluate_chunks
+    from .evaluate import ModelOn, evaluate_chunks
     from .report import print_means
 
     entries = read_index(index)
@@ -141,7 +139,7 @@ def chunks(
     result = evaluate_chunks(
         folder,
         index,
-        _open(model, provider, session),
+        ModelOn(find_model(model), provider, session),
         near=near,
         far=far,
         on_scene=StripWriter(out, SCENES_WITH_STRIPS),
@@ -178,13 +176,13 @@ def synthetic(
     quiet: Quiet = False,
 ) -> None:
     """Evaluate on the held-out synthetic scenes: depth against the truth, and novel views (extra `eval`)."""
-    from .evaluate import evaluate_synthetic
+    from .evaluate import ModelOn, evaluate_synthetic
     from .report import print_means
 
     session = session_config(threads, device, provider_option)
     _check_outputs(model, out, [])
     result = evaluate_synthetic(
-        _open(model, provider, session),
+        ModelOn(find_model(model), provider, session),
         scenes=scenes,
         views=views,
         pool_views=pool_views,
@@ -225,14 +223,14 @@ def captures(
     from ...runtime.images.png import save_png
     from .captures.capture import parse_view_counts
     from .captures.report import print_captures, write_capture_results
-    from .evaluate import evaluate_captures
+    from .evaluate import ModelOn, evaluate_captures
 
     counts = parse_view_counts(views)
     session = session_config(threads, device, provider_option)
     _check_outputs(model, out, [])
     result = evaluate_captures(
         checkouts,
-        _open(model, provider, session),
+        ModelOn(find_model(model), provider, session),
         captures=capture or [],
         view_counts=counts,
         quality=quality,
@@ -267,13 +265,6 @@ class StripWriter:
             for name, strip in zip(name_files(list(strips)), strips.values(), strict=True):
                 save_png(strip_file(self.folder, result.name, name), strip)
         self.scenes += 1
-
-
-def _open(model: Path | None, provider: str, session: "SessionConfig") -> "Predictor":
-    """The model on its execution provider; the bundled model where none is given."""
-    from ...runtime.inference.predictor import Predictor
-
-    return Predictor(find_model(model), provider, session)
 
 
 def _by(size: tuple[int, int]) -> str:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from ...runtime.images.finding import find_images
 from ...runtime.inference.metadata import ModelMetadata
 from ...runtime.inference.named_models import find_model
 from ...runtime.inference.predictor import Predictor
+from ...runtime.inference.session import SessionConfig
 from ...runtime.reconstruction.quality import Quality
 from ...runtime.reconstruction.steps import make_plan
 from ...runtime.splats.filtering import FilterOptions
@@ -37,7 +39,17 @@ from .novel_views import Evaluator, Result, Scores, mean_of_scenes, mean_of_view
 
 # Receives a scene's metrics and, by target, its strip: truth, render, error, depth and, if measured, the oracle plane.
 OnScene = Callable[[Result, dict[str, np.ndarray]], None]
-Model = Predictor | Path | str | None
+
+
+class ModelOn(NamedTuple):
+    """A model and where it runs: the execution provider, its device and options, and threads."""
+
+    path: Path
+    provider: str
+    session: SessionConfig
+
+
+Model = Predictor | ModelOn | Path | str | None
 
 
 @dataclass(frozen=True)
@@ -224,7 +236,9 @@ def evaluate_captures(
 
 
 def _opened(model: Model) -> Predictor:
-    return model if isinstance(model, Predictor) else Predictor(find_model(model))
+    if isinstance(model, ModelOn):
+        return Predictor(*model)
+    return Predictor(find_model(model)) if model is None or isinstance(model, Path | str) else model
 
 
 def _load_metrics() -> tuple[dict[str, PerceptualMetric], list[str]]:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from conftest import SMALL, SMALL_PRESET, run_command
 from idesplat.runtime.errors import InputError
-from idesplat.runtime.inference.providers import CPU
+from idesplat.runtime.inference.providers import CPU, DOCUMENTATION_ALONE, PROVIDERS, is_installed
 from idesplat.runtime.inference.session import SessionConfig, open_session
 from idesplat.tools.benchmark import cli as bench
 from idesplat.tools.benchmark import runner, training
@@ -291,3 +291,27 @@ def test_the_environment_is_restored(monkeypatch):
         assert (os.environ["OMP_NUM_THREADS"], os.environ["MKL_NUM_THREADS"]) == ("3", "3")
     assert os.environ["OMP_NUM_THREADS"] == "7"
     assert "MKL_NUM_THREADS" not in os.environ
+
+
+# ---- execution providers
+
+
+def test_providers_are_listed_with_their_packages_and_what_was_tried(capsys):
+    assert run_command(bench.main, "--list-providers") == 0
+    lines = capsys.readouterr().out.splitlines()
+    for provider in PROVIDERS:
+        (line,) = [line for line in lines if f" {provider.name} " in line and f" {provider.package} " in line]
+        assert provider.tried in line
+        assert "not installed" in line or is_installed(provider)
+    untried = [provider.name for provider in PROVIDERS if provider.tried == DOCUMENTATION_ALONE]
+    assert untried == ["CUDA", "TensorRT", "TensorRT-RTX", "DirectML", "CoreML", "MLX", "QNN"]
+
+
+def test_options_of_a_provider_need_to_say_whose_they_are(capsys):
+    assert run_command(bench.main, "--provider", "CPU", "--provider", "WebGPU", "--device", "0") == 2
+    assert "expected one --provider, whose they are" in capsys.readouterr().err
+
+
+def test_a_provider_that_is_not_there_is_a_row_with_a_reason(exported, capsys):
+    assert run_command(bench.main, exported[0], "--provider", "CUDA", "--no-eager", *USUAL) == 2
+    assert "pip install onnxruntime-gpu" in capsys.readouterr().err

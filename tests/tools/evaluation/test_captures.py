@@ -209,7 +209,7 @@ def measured(
 ) -> tuple[dict[str, Any], Predictor]:
     """The command's results for triples and three views, with the predictor that it used."""
     opened = Predictor(exported[0])
-    monkeypatch.setattr(library, "Predictor", lambda path: opened)
+    monkeypatch.setattr(library, "Predictor", lambda path, *where: opened)
     monkeypatch.chdir(capture_file.parent)
     checkouts_folder = repository[0].parents[1]
     options = ("--checkouts", checkouts_folder, "--model", exported[0], "--out", "out", "--views", "3, 2,4")

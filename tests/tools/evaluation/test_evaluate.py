@@ -47,8 +47,13 @@ def workplace(scene: Path, exported: tuple[Path, Path], opened: Predictor, tmp_p
     index = {"x": None, "b": {"context": [0, 4], "target": [1, 2, 3]}, "gone": {"context": [0, 1], "target": [2]}}
     (tmp_path / "index.json").write_text(json.dumps(index))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(library, "Predictor", lambda path: opened if path == Path("model.onnx") else Predictor(path))
+    monkeypatch.setattr(library, "Predictor", open_or_take(opened))
     return tmp_path
+
+
+def open_or_take(opened: Predictor) -> Callable[..., Predictor]:
+    """What stands for `Predictor`: the opened model for the workplace's, so that it is opened once."""
+    return lambda path, *where: opened if path == Path("model.onnx") else Predictor(path, *where)
 
 
 Capture = pytest.CaptureFixture[str]
