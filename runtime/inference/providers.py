@@ -67,6 +67,12 @@ class Provider:
             return ""
 
 
+def _webgpu(threads: int, device: str, cache: Path | None) -> dict[str, str]:
+    # In the layout that it prefers by itself, convolutions of some numbers of input channels are wrong, such as 18
+    # (version 0.4.0; microsoft/onnxruntime#29651).
+    return {"preferredLayout": "NCHW"}
+
+
 def _openvino(threads: int, device: str, cache: Path | None) -> dict[str, str]:
     # By default it computes in bfloat16 on CPUs with bfloat16 instructions, which changes depths by more than half.
     settings = {"INFERENCE_PRECISION_HINT": "f32"}
@@ -107,12 +113,13 @@ PROVIDERS = (
         *("WebGPU", "WebGpuExecutionProvider", "onnxruntime-ep-webgpu", "GPUs with Vulkan, Direct3D 12 or Metal"),
         module="onnxruntime_ep_webgpu",
         tried="0.4.0 on a software adapter alone",
+        defaults=_webgpu,
         memory="gpu",
     ),
     Provider(
         *("OpenVINO", "OpenVINOExecutionProvider", "onnxruntime-ep-openvino", "Intel CPUs, GPUs and NPUs"),
         module="onnxruntime_ep_openvino",
-        tried="1.8.1 on a CPU alone",
+        tried="1.8.1 on an AMD CPU, its vendor check removed",
         defaults=_openvino,
         device="cpu",
         caches=True,
