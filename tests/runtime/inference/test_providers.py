@@ -154,7 +154,7 @@ def test_the_device_is_chosen_by_type_or_number(found):
         choose_device(provider, "-1")
 
 
-def test_without_a_device_it_is_refused(found, exported):
+def test_without_a_device_it_is_refused(found):
     found(device("OpenVINOExecutionProvider.AUTO", "CPU"))
     with pytest.raises(InputError, match=r"^OpenVINO finds no device here, it runs on Intel CPUs.* --provider CPU"):
         choose_device(BY_NAME["OpenVINO"], None)
@@ -176,9 +176,9 @@ def test_a_plug_in_that_cannot_be_loaded_is_refused_in_one_line(monkeypatch):
         (SessionConfig(provider_options={"a": "b"}), "the CPU provider has neither"),
     ],
 )
-def test_the_cpu_has_no_devices_or_options(config, expected, exported):
+def test_the_cpu_has_no_devices_or_options(config, expected, model):
     with pytest.raises(InputError, match=expected):
-        Predictor(exported[0], config=config)
+        open_session(model, config=config)
 
 
 # ---- options
