@@ -1,6 +1,7 @@
 """The file of a released checkpoint: downloaded from the hub where its authors publish it, or from a local folder."""
 
 import os
+import re
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
@@ -11,9 +12,11 @@ from ...model.checkpoint import file_sha256
 from ...runtime.errors import InputError
 from ...runtime.inference.known_models import REVISION, KnownModel
 from ...runtime.system.cache_folder import cache_folder
+from ...runtime.system.files import make_folder
 from ...runtime.system.progress import CALLBACK, Progress, ProgressCallback
 
-SHA256_DIGITS = 64
+SHA256 = re.compile("[0-9a-f]{64}")
+REMOVED = "it was removed; pull it again"
 HIDDEN_DIGITS = 8  # of a hash in messages
 
 
@@ -21,7 +24,7 @@ def fetch_checkpoint(model: KnownModel, source: Path | None = None, revision: st
     """The path of a released checkpoint whose SHA-256 was checked.
 
     source: a folder that has the file, or the file, instead of a download. revision: a commit or branch of the
-    repository. A download goes to the cache folder, resumes where an earlier one ended, and is not repeated.
+    repository. A download goes to the cache folder, continues where an earlier one ended, and is not repeated.
     Raises InputError if the file cannot be had, or is not the released one.
     """
     if source is not None:
@@ -30,17 +33,19 @@ def fetch_checkpoint(model: KnownModel, source: Path | None = None, revision: st
             raise InputError(f"{path}: no such file; give the folder that has {model.file}")
         _check(path, model.sha256_prefix, "copy it again")
         return path
-    path = _download(model, revision or REVISION)
-    # The hub's cache names a file after the hash that the hub states, which is the SHA-256 of large files.
-    stated = path.resolve().name
-    expected = model.sha256_prefix or (stated if len(stated) == SHA256_DIGITS else "")
+    folder = cache_folder("downloads") / model.repository.replace("/", "--")
+    path = _downloaded(folder, model.file, revision) or _download(model, revision or REVISION, folder)
     try:
-        _check(path, expected, "it was removed; pull it again")
+        _check(path, model.sha256_prefix, REMOVED)
     except InputError:
-        path.resolve().unlink()
-        path.unlink(missing_ok=True)
+        path.unlink()
         raise
     return path
+
+
+def _downloaded(folder: Path, file: str, revision: str | None) -> Path | None:
+    """An earlier download, of the commit if one is asked for."""
+    return next((path for path in sorted(folder.glob(f"*/{file}")) if revision in (None, path.parent.name)), None)
 
 
 def _check(path: Path, expected: str, remedy: str) -> None:
@@ -53,39 +58,50 @@ def _check(path: Path, expected: str, remedy: str) -> None:
         )
 
 
-def _download(model: KnownModel, revision: str) -> Path:
-    """The file in the cache of the hub's library, in our cache folder."""
+def _download(model: KnownModel, revision: str, folder: Path) -> Path:
+    """Download a file to the folder of its commit; what an interrupted download left is continued."""
     if find_spec("huggingface_hub") is None:
         raise InputError(
             "downloading needs huggingface_hub, which is not installed; pip install 'idesplat[hub]', or give a folder "
             f"that has {model.file} as --from"
         )
-    folder = cache_folder("downloads")
-    # Read when it is imported. It would send the versions of other packages along, and write to another cache.
-    os.environ.setdefault("HF_HUB_DISABLE_TELEMETRY", "1")
-    os.environ.setdefault("HF_XET_CACHE", str(folder / "xet"))
-    from huggingface_hub import hf_hub_download
+    os.environ.setdefault("HF_HUB_DISABLE_TELEMETRY", "1")  # read when it is imported
+    from huggingface_hub import get_hf_file_metadata, hf_hub_url
+    from huggingface_hub.file_download import http_get
+    from huggingface_hub.utils import build_hf_headers
 
     endpoint = os.environ.get("HF_ENDPOINT") or None
+    # The repositories are public: no token is sent.
+    headers = build_hf_headers(token=False, library_name="idesplat", library_version=version("idesplat"))
     try:
-        return Path(
-            hf_hub_download(
-                model.repository,
-                model.file,
-                revision=revision,
-                cache_dir=folder,
-                endpoint=endpoint,
-                library_name="idesplat",
-                library_version=version("idesplat"),
+        url = hf_hub_url(model.repository, model.file, revision=revision, endpoint=endpoint)
+        stated = get_hf_file_metadata(url, headers=headers, endpoint=endpoint)
+        path = folder / str(stated.commit_hash) / model.file
+        # `hf_hub_download` would start again: since version 2 it keeps nothing of an interrupted download.
+        part = make_folder(path.parent) / f"{model.file}.part"
+        with part.open("ab") as file:
+            http_get(
+                stated.location,
+                file,
+                resume_size=file.tell(),
+                headers=headers,
+                expected_size=stated.size,
+                displayed_filename=model.file,
                 tqdm_class=_progress_bar(CALLBACK.get(), f"downloading {model.file}"),
             )
-        )
     except Exception as error:  # of the hub's library, of its HTTP library, of the system
         reason = " ".join(str(error).split())
         raise InputError(
             f"{model.file} cannot be downloaded from {endpoint or 'huggingface.co'}/{model.repository} at {revision} "
             f"({reason}); pull it again to resume, set HF_ENDPOINT to a mirror, or give a folder that has it as --from"
         ) from None
+    try:
+        # The hub states the SHA-256 of large files as their ETag.
+        _check(part, stated.etag if stated.etag and SHA256.fullmatch(stated.etag) else "", REMOVED)
+    except InputError:
+        part.unlink()
+        raise
+    return part.replace(path)
 
 
 def _progress_bar(callback: ProgressCallback | None, description: str) -> Any:

@@ -14,14 +14,16 @@ COMMIT = "0123456789abcdef0123456789abcdef01234567"
 class Hub:
     """A server's files by `owner/name/resolve/revision/file`, and what was asked of it.
 
-    cut: after this many bytes it breaks off the next transfer, once; 0 for never. url: where it is.
+    cut: after this many bytes it breaks off the next transfer; 0 for never. closed: it then refuses to send more.
+    url: where it is.
     """
 
     files: dict[str, bytes]
     cut: int = 0
+    closed: bool = False
     url: str = ""
     requests: list[tuple[str, str, str]] = field(default_factory=list)  # method, path, range
-    sent: int = 0
+    etag: str = ""  # instead of the file's SHA-256
 
 
 @contextmanager
@@ -40,6 +42,11 @@ def serve_hub(files: dict[str, bytes], cut: int = 0) -> Iterator[Hub]:
             asked = self.headers.get("Range", "")
             hub.requests.append((self.command, self.path, asked))
             content = hub.files.get(self.path.lstrip("/"))
+            if hub.closed:
+                self.send_response(403)
+                self.send_header("Content-Length", "0")
+                self.end_headers()
+                return
             if content is None:
                 self.send_response(404)
                 self.send_header("X-Error-Code", "EntryNotFound")
@@ -49,7 +56,7 @@ def serve_hub(files: dict[str, bytes], cut: int = 0) -> Iterator[Hub]:
             start = int(asked.removeprefix("bytes=").partition("-")[0] or 0)
             self.send_response(206 if start else 200)
             self.send_header("X-Repo-Commit", COMMIT)
-            self.send_header("ETag", f'"{hashlib.sha256(content).hexdigest()}"')
+            self.send_header("ETag", f'"{hub.etag or hashlib.sha256(content).hexdigest()}"')
             self.send_header("Accept-Ranges", "bytes")
             self.send_header("Content-Length", str(len(content) - start))
             if start:
@@ -59,10 +66,9 @@ def serve_hub(files: dict[str, bytes], cut: int = 0) -> Iterator[Hub]:
                 return
             part = content[start:]
             if hub.cut:
-                part, hub.cut = part[: hub.cut], 0
+                part, hub.cut, hub.closed = part[: hub.cut], 0, True
                 self.close_connection = True
             self.wfile.write(part)
-            hub.sent += len(part)
 
         def log_message(self, *arguments: object) -> None:
             pass
