@@ -15,7 +15,7 @@ from ...runtime.system.cache_folder import cache_folder
 from ...runtime.system.files import make_folder
 from ...runtime.system.progress import CALLBACK, Progress, ProgressCallback
 
-SHA256 = re.compile("[0-9a-f]{64}")
+SHA256, COMMIT = re.compile("[0-9a-f]{64}"), re.compile("[0-9a-f]{40}")
 REMOVED = "it was removed; pull it again"
 HIDDEN_DIGITS = 8  # of a hash in messages
 
@@ -75,8 +75,11 @@ def _download(model: KnownModel, revision: str, folder: Path) -> Path:
     headers = build_hf_headers(token=False, library_name="idesplat", library_version=version("idesplat"))
     try:
         url = hf_hub_url(model.repository, model.file, revision=revision, endpoint=endpoint)
-        stated = get_hf_file_metadata(url, headers=headers, endpoint=endpoint)
-        path = folder / str(stated.commit_hash) / model.file
+        stated = get_hf_file_metadata(url, token=False, headers=headers, endpoint=endpoint)
+        commit = stated.commit_hash or ""
+        if not COMMIT.fullmatch(commit):  # it names a folder
+            raise ValueError("the server states no commit; is it a hub?")
+        path = folder / commit / model.file
         # `hf_hub_download` would start again: since version 2 it keeps nothing of an interrupted download.
         part = make_folder(path.parent) / f"{model.file}.part"
         with part.open("ab") as file:

@@ -23,6 +23,7 @@ class Hub:
     closed: bool = False
     url: str = ""
     requests: list[tuple[str, str, str]] = field(default_factory=list)  # method, path, range
+    commit: str = COMMIT
     etag: str = ""  # instead of the file's SHA-256
 
 
@@ -55,7 +56,7 @@ def serve_hub(files: dict[str, bytes], cut: int = 0) -> Iterator[Hub]:
                 return
             start = int(asked.removeprefix("bytes=").partition("-")[0] or 0)
             self.send_response(206 if start else 200)
-            self.send_header("X-Repo-Commit", COMMIT)
+            self.send_header("X-Repo-Commit", hub.commit)
             self.send_header("ETag", f'"{hub.etag or hashlib.sha256(content).hexdigest()}"')
             self.send_header("Accept-Ranges", "bytes")
             self.send_header("Content-Length", str(len(content) - start))

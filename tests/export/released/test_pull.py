@@ -162,6 +162,14 @@ def test_a_file_that_is_not_on_the_hub_is_one_line(hub: Hub, nano, capsys):
     assert printed.count("\n") == 1
 
 
+@pytest.mark.parametrize("commit", ("", "../../../up"))
+def test_a_server_that_states_no_commit_is_refused(commit, hub: Hub, nano, tmp_path):
+    hub.commit = commit
+    with pytest.raises(InputError, match=r"cannot be downloaded from .* \(.*hub"):
+        fetch_checkpoint(nano)
+    assert not files_in(tmp_path)
+
+
 def test_a_folder_takes_the_place_of_a_download(nano, content, tmp_path):
     (tmp_path / "files").mkdir()
     path = tmp_path / "files" / nano.file
