@@ -181,7 +181,7 @@ def find_provider(text: str) -> Provider:
                 there = ", ".join(other.name for other in known if is_installed(other))
                 raise InputError(
                     f"execution provider {provider.name} is not installed; pip install {provider.package}{instead} "
-                    f"(installed: {there})"
+                    f"(for {provider.hardware}; installed: {there})"
                 )
             return provider
     names = ", ".join(provider.name for provider in known)

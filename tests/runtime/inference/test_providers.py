@@ -78,7 +78,7 @@ def test_the_error_of_a_missing_provider_names_its_package(provider):
 
 
 def test_a_build_of_onnx_runtime_is_said_to_replace_the_installed_one():
-    with pytest.raises(InputError, match=r"pip install onnxruntime-gpu instead of onnxruntime \(installed: CPU"):
+    with pytest.raises(InputError, match=r"pip install onnxruntime-gpu instead of onnxruntime \(for NVIDIA GPUs; inst"):
         find_provider("CUDA")
 
 
@@ -94,7 +94,8 @@ def test_the_command_names_the_package_and_writes_nothing(monkeypatch, scene, tm
     assert run_command(cli.main, "--model", exported[0], "--provider", "OpenVINO", *arguments) == 2
     printed = capsys.readouterr().err
     assert printed.startswith(
-        "error: execution provider OpenVINO is not installed; pip install onnxruntime-ep-openvino (installed: CPU)"
+        "error: execution provider OpenVINO is not installed; pip install onnxruntime-ep-openvino (for Intel CPUs, GPUs "
+        "and NPUs; installed: CPU)"
     )
     assert printed.count("\n") == 1
     assert not out.exists()
