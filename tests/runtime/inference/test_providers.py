@@ -94,8 +94,8 @@ def test_the_command_names_the_package_and_writes_nothing(monkeypatch, scene, tm
     assert run_command(cli.main, "--model", exported[0], "--provider", "OpenVINO", *arguments) == 2
     printed = capsys.readouterr().err
     assert printed.startswith(
-        "error: execution provider OpenVINO is not installed; pip install onnxruntime-ep-openvino (for Intel CPUs, GPUs "
-        "and NPUs; installed: CPU)"
+        "error: execution provider OpenVINO is not installed; pip install onnxruntime-ep-openvino "
+        "(for Intel CPUs, GPUs and NPUs; installed: CPU)"
     )
     assert printed.count("\n") == 1
     assert not out.exists()
