@@ -326,6 +326,18 @@ def test_outputs_stay_on_the_device_between_stages(model):
     assert done.stdout == "webgpu\n[16.0, 81.0]\n", done.stderr
 
 
+def test_staged_graphs_leave_tensors_where_the_next_stage_reads_them(exported):
+    """With the CPU's memory in the place of a GPU's."""
+    inputs = example_inputs(2, 64, 96, 0.5, 100.0)
+    arrays = [inputs[name].numpy() for name in INPUTS]
+    predictor = Predictor(exported[1])
+    expected = predictor.predict_arrays(*arrays)
+    predictor.provider = replace(BY_NAME["CPU"], memory="cpu")
+    found = predictor.predict_arrays(*arrays)
+    np.testing.assert_array_equal(found.depth, expected.depth)
+    np.testing.assert_array_equal(found.need_gaussians().means, expected.need_gaussians().means)
+
+
 def test_openvino_computes_the_same(exported):
     pytest.importorskip("onnxruntime_ep_openvino")
     try:
