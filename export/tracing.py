@@ -16,14 +16,15 @@ from .example_inputs import example_inputs, room_inputs
 from .graph.cleanup import simplify
 from .graph.external_data import fill_inputs
 from .graph.fold_shapes import declare_shapes, fold_shapes
-from .graph.fuse import fuse_nodes, replace_rounding
+from .graph.fuse import fuse_nodes
 from .graph.gather_loops import chunked, lower_custom_ops
 from .graph.symbolic_shapes import SymbolicShapes
 from .graph.unroll import unroll_loops
+from .graph.webgpu import pad_channels, replace_rounding
 from .precision.convert import convert_precision
 from .precision.int8 import Feeds
 from .stages import NamedTensors, Stage, find_stages, stage_graph
-from .targets import MAX_TRACED_OPSET, OPSET, GraphSettings
+from .targets import MAX_TRACED_OPSET, OPSET, WEB, GraphSettings
 
 # Of opset 20 and later; earlier opsets, which are for older runtimes, have the least that fits them.
 IR_VERSION = 10
@@ -93,6 +94,8 @@ def export_graphs(
     if settings.target.gather_bytes is not None:
         unroll_loops(traced, known, settings.target.gather_bytes, dims.sizes)
         replace_rounding(traced)
+    if settings.target.name == WEB:
+        pad_channels(traced, folder)
     layers = network.family.quantizable
     examples = settings.calibration or _examples(metadata, static)
     traced = convert_precision(metadata.precision, traced, folder / WEIGHTS, layers, examples)

@@ -12,7 +12,7 @@ import numpy as np
 import onnx
 import sympy
 
-from . import shape_rules  # noqa: F401  # registers the rules
+from . import layer_shape_rules, shape_rules  # noqa: F401  # they register the rules
 from .subgraph import remove_unread, sort_nodes
 from .symbolic_shapes import Shape, SymbolicShapes, attributes
 

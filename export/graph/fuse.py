@@ -12,7 +12,8 @@ from .symbolic_shapes import SymbolicShapes
 def fuse_nodes(model: onnx.ModelProto, known: SymbolicShapes) -> None:
     """Fuse group norms and the scales of attention in place.
 
-    known: shapes of the graph's tensors, which are to be inferred again afterwards. Results are equal but for the rounding of attention's scales.
+    known: shapes of the graph's tensors, which are to be inferred again afterwards. Results are equal but for the
+    rounding of attention's scales.
     """
     graph = _Graph(model.graph)
     for node in list(model.graph.node):
@@ -21,23 +22,6 @@ def fuse_nodes(model: onnx.ModelProto, known: SymbolicShapes) -> None:
         elif node.op_type == "MatMul":
             _fuse_scales(graph, node)
     remove_unread(model.graph)
-
-
-def replace_rounding(model: onnx.ModelProto) -> None:
-    """Round as Floor of what is half more, in place: WebGPU has no kernel for Round.
-
-    The two differ where a number is exactly between two integers: Round then takes the even one.
-    """
-    half = "rounding.half"
-    rounds = [node for node in model.graph.node if node.op_type == "Round"]
-    for node in rounds:
-        raised = f"{node.output[0]}.raised"
-        add = onnx.helper.make_node("Add", [node.input[0], half], [raised], name=f"{node.name}/Add")
-        floor = onnx.helper.make_node("Floor", [raised], list(node.output), name=node.name)
-        model.graph.node.insert(list(model.graph.node).index(node), add)
-        _replace(model.graph, node, floor)
-    if rounds:
-        model.graph.initializer.append(onnx.numpy_helper.from_array(np.array(0.5, np.float32), half))
 
 
 class _Graph:

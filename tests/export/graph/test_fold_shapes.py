@@ -8,9 +8,10 @@ import sympy
 import torch
 import torch.nn.functional as F
 from idesplat.export.graph.fold_shapes import declare_shapes, fold_shapes
-from idesplat.export.graph.fuse import fuse_nodes, replace_rounding
+from idesplat.export.graph.fuse import fuse_nodes
 from idesplat.export.graph.symbolic_shapes import SymbolicShapes
 from idesplat.export.graph.unroll import unroll_loops
+from idesplat.export.graph.webgpu import pad_channels, replace_rounding
 from idesplat.runtime.inference.session import open_session, run_session
 
 VIEWS, ROWS, COLUMNS = (sympy.Symbol(name, integer=True, positive=True) for name in ("views", "rows", "columns"))
@@ -219,3 +220,21 @@ def test_rounding_is_floor_of_half_more() -> None:
     replace_rounding(model)
     assert operators(model) == ["Add", "Floor"]
     np.testing.assert_array_equal(run(model, SIZES[0])[0], expected[0])
+
+
+@pytest.mark.parametrize(("channels", "read"), ((8, 8), (6, 8), (3, 3), (5, 5)))
+def test_convolutions_that_webgpu_computes_wrongly_get_channels_of_zeros(channels: int, read: int, tmp_path) -> None:
+    """Multiples of three, but for three itself and multiples of four."""
+    weights = {"kernel": np.random.default_rng(1).standard_normal((4, channels, 3, 3)).astype(np.float32)}
+    weights |= {name: np.array([value]) for name, value in (("zero", 0), ("count", channels), ("axis", 1))}
+    text = f"""(float[a, b, c, d] y)
+        <float[4, {channels}, 3, 3] kernel, int64[1] zero, int64[1] count, int64[1] axis> {{
+        some = Slice (x, zero, count, axis)
+        y = Conv <pads = [1, 1, 1, 1]> (some, kernel)
+    }}"""
+    model, _ = parse(text, weights)
+    expected = run(model, SIZES[0])
+    pad_channels(model, tmp_path)
+    kernels = [tensor for tensor in model.graph.initializer if len(tensor.dims) == 4]
+    assert [tensor.dims[1] for tensor in kernels] == [read]
+    np.testing.assert_allclose(run(model, SIZES[0])[0], expected[0], atol=1e-5)
