@@ -106,7 +106,10 @@ class _Folder:
         """Copy dimensions (0), leave one open (-1), and write the others; skip a Reshape before."""
         before = self.producers.get(node.input[0])
         source = before.input[0] if before is not None and before.op_type in RESHAPING else node.input[0]
-        dims = self._target(self.known.shapes.get(source), target)
+        own = [axis for axis, dim in enumerate(target) if self._is_read_from(dim, node.output[0])]
+        if len(own) > 1:
+            return
+        dims = self._target(self.known.shapes.get(source), target, own)
         computed = any(not dim.is_Integer for dim in dims)
         if node.op_type in ("Squeeze", "Unsqueeze") and (source == node.input[0] or computed):
             return
@@ -114,16 +117,20 @@ class _Folder:
         node.op_type = "Reshape"
         node.input[:] = [source, self._integers(_array(dims))]
 
+    def _is_read_from(self, dim: sympy.Expr, name: str) -> bool:
+        """Whether a dimension is known only from a tensor that has it."""
+        return any(self.sources[symbol][0] == name for symbol in dim.free_symbols if symbol in self.sources)
+
     @staticmethod
-    def _target(shape: Shape | None, target: Shape) -> list[sympy.Expr]:
-        """The second input of a Reshape from one shape to another."""
+    def _target(shape: Shape | None, target: Shape, left_open: list[int]) -> list[sympy.Expr]:
+        """The second input of a Reshape from one shape to another. left_open: an axis that only the result tells."""
         dims: list[sympy.Expr] = []
         for axis, dim in enumerate(target):
             copied = shape is not None and axis < len(shape) and dim == shape[axis] and not dim.is_Integer
             dims.append(sympy.Integer(0) if copied else dim)
         symbolic = [axis for axis, dim in enumerate(dims) if not dim.is_Integer]
         if symbolic:
-            dims[symbolic[0]] = sympy.Integer(-1)
+            dims[(left_open or symbolic)[0]] = sympy.Integer(-1)
         return dims
 
     def _expand(self, node: onnx.NodeProto, target: Shape) -> None:

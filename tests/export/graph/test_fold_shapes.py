@@ -118,6 +118,23 @@ def test_a_size_that_only_the_data_knows_is_read_from_it() -> None:
     assert operators(after).count("Compress") == 1
 
 
+def test_a_reshape_of_what_has_no_known_shape_leaves_a_dimension_open() -> None:
+    """Its result's shape is known from the result alone, which its target must not be computed from."""
+    _, after = folded(
+        """(float[a, b] y) {
+            flat = Constant <value_ints = [-1]> ()
+            values = Reshape (x, flat)
+            zero = Constant <value = float {0}> ()
+            all = GreaterOrEqual (values, values)
+            found = Compress (values, all)
+            height = Shape <start = 2, end = 3> (x)
+            target = Concat <axis = 0> (height, flat)
+            y = Reshape (found, target)
+        }"""
+    )
+    assert operators(after)[-1] == "Reshape"
+
+
 def test_a_resize_to_a_multiple_has_scales() -> None:
     _, after = folded(
         """(float[a, b, c, d] y) {
