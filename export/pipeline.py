@@ -13,7 +13,6 @@ from ..runtime.inference.metadata import ModelMetadata
 from ..runtime.system.files import check_writable
 from ..runtime.system.outputs import Outputs
 from ..runtime.system.progress import ProgressCallback, reporting_to
-from .hub import graph_path, hub_files, write_hub_files
 from .targets import GraphSettings, check_opset, parse_target
 
 if TYPE_CHECKING:
@@ -30,7 +29,7 @@ MAX_PIXELS = 1 << 24
 class ExportResult:
     """What an export wrote.
 
-    files: the graph and, where these are not in it, its weights; the files of a hub folder; the staged folder.
+    files: the graph and, where these are not in it, its weights; the staged folder; the files of a hub folder.
     errors: of every tensor in every verification case against PyTorch, with their bounds; none without verification.
     """
 
@@ -119,12 +118,16 @@ def export_checkpoint(
         if not files:
             raise MismatchError(errors)
         if hub is not None:
-            files[-1:-1] = write_hub_files(hub, metadata, verify)
+            from .hub import write_hub_files
+
+            files += write_hub_files(hub, metadata, verify)
     return ExportResult(metadata, files, errors)
 
 
 def _hub_graph(outputs: Outputs, hub: Path, out: Path | None, precision: str, target: str) -> Path:
     """Where the graph of a hub folder goes; raises InputError if the folder's other files must not be written."""
+    from .hub import graph_path, hub_files
+
     if out is not None:
         raise InputError(f"{out}: with --hub the graph's name is given by its precision; leave it out")
     if hub.exists() and not hub.is_dir():

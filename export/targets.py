@@ -2,10 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from ..runtime.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
 
 MIB = 1 << 20
 # TorchScript's exporter writes up to 20. Opset 21 has the same operators with more types.
@@ -48,7 +50,7 @@ class GraphSettings:
     opset: int = OPSET
     verify: bool = True
     external_data: bool = False
-    calibration: Sequence[Mapping[str, np.ndarray]] = ()
+    calibration: "Sequence[Mapping[str, np.ndarray]]" = ()
 
 
 def parse_target(name: str) -> Target:
