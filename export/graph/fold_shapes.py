@@ -5,7 +5,7 @@ expression of the inputs' dimensions (symbolic_shapes.py). A target of Reshape o
 leaves one of them open, becomes a constant; all else is computed from the inputs' shapes, once.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -66,6 +66,9 @@ class _Folder:
         self.replaced: dict[str, str] = {}
         self.producers = {name: node for node in graph.node for name in node.output}
         self.sources = dict(known.sources)
+        # In a stage's graph: dimensions that only a tensor of another stage tells.
+        inside = {*self.producers, *inputs}
+        self.unknown = {symbol for symbol, (name, _) in known.sources.items() if name not in inside}
         # A symbol is an input's dimension divided by a number.
         self.divisors: dict[sympy.Symbol, int] = {}
         for name in inputs:
@@ -85,13 +88,13 @@ class _Folder:
                 self.replaced[node.output[0]] = node.input[0]
             for index, name in enumerate(node.input):
                 value = self.known.values.get(name)
-                if value is not None and name not in self.constants:
+                if value is not None and name not in self.constants and self._is_derivable(value.flat):
                     node.input[index] = self._integers(value)
 
     def _rewrite(self, node: onnx.NodeProto) -> None:
         """Give a node constants in place of a shape, where it has an equivalent."""
         target = self.known.shapes.get(node.output[0])
-        if target is None:
+        if target is None or not self._is_derivable(target):
             return
         if node.op_type in ("Reshape", "Flatten", "Squeeze", "Unsqueeze"):
             self._reshape(node, target)
@@ -116,6 +119,10 @@ class _Folder:
         del node.attribute[:]
         node.op_type = "Reshape"
         node.input[:] = [source, self._integers(_array(dims))]
+
+    def _is_derivable(self, dims: Iterable[sympy.Expr]) -> bool:
+        """Whether dimensions can be computed from tensors of this graph."""
+        return not any(dim.free_symbols & self.unknown for dim in dims)
 
     def _is_read_from(self, dim: sympy.Expr, name: str) -> bool:
         """Whether a dimension is known only from a tensor that has it."""

@@ -28,11 +28,17 @@ ONE = sympy.Integer(1)
 @rule(
     *("Sigmoid", "Gelu", "Relu", "Softmax", "Exp", "Clip", "Neg", "Abs", "Floor", "Round", "Cos", "Sin", "Softplus"),
     *("Reciprocal", "Not", "LayerNormalization", "InstanceNormalization", "BatchNormalization", "Sqrt", "Erf", "Tanh"),
-    *("QuantizeLinear", "DequantizeLinear", "DynamicQuantizeLinear", "Identity", "IsNaN", "HardSigmoid", "Sign"),
+    *("QuantizeLinear", "DequantizeLinear", "Identity", "IsNaN", "HardSigmoid", "Sign"),
 )
 def _same(known: SymbolicShapes, node: onnx.NodeProto) -> Result:
     value = known.value(node, 0) if node.op_type == "Identity" else None
     return [(known.shape(node), value)]
+
+
+@rule("DynamicQuantizeLinear")
+def _quantize(known: SymbolicShapes, node: onnx.NodeProto) -> Result:
+    """The integers, and their scale and zero point."""
+    return [(known.shape(node), None), ((), None), ((), None)]
 
 
 @rule("Cast")
