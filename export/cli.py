@@ -32,7 +32,32 @@ def export(
         int | None, typer.Option(help="Make the number of views static.", min=MIN_VIEWS, max=MAX_VIEWS)
     ] = None,
     size: Annotated[str | None, typer.Option(help="Make the image size static, such as 256x256.")] = None,
-    precision: Annotated[str, typer.Option(help="float32, int8 (for CPUs) or fp16 (for GPUs).")] = "float32",
+    precision: Annotated[
+        str, typer.Option(help="float32, fp16 (for GPUs), int8 (for CPUs) or int8-qdq (for TensorRT and QNN).")
+    ] = "float32",
+    target: Annotated[
+        str, typer.Option(help="cpu, gpu or web: gpu and web have no Loop; web runs wholly on WebGPU.")
+    ] = "cpu",
+    opset: Annotated[int, typer.Option(help="Version of ONNX's operators, 17 to 21.")] = 20,
+    calibrate: Annotated[
+        Path | None,
+        typer.Option(help="Images on which the ranges of int8 are found, with --cameras.", show_default=False),
+    ] = None,
+    cameras: Annotated[
+        Path | None, typer.Option("--cameras", "-c", help="Cameras of the images of --calibrate.", show_default=False)
+    ] = None,
+    external_data: Annotated[
+        bool, typer.Option("--external-data", help="Write the weights to a file of their own.")
+    ] = False,
+    hub: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for a model hub: onnx/model*.onnx, config.json, model card, checksums.", show_default=False
+        ),
+    ] = None,
+    no_verify: Annotated[
+        bool, typer.Option("--no-verify", help="Do not compare the graphs with PyTorch, which takes a minute or so.")
+    ] = False,
     overwrite: Overwrite = False,
     config: Config = None,
     verbose: Annotated[
@@ -47,7 +72,7 @@ def export(
     ] = 0,
     quiet: Quiet = False,
 ) -> None:
-    """Write a checkpoint as a standard ONNX graph (opset 20), and verify it against PyTorch.
+    """Write a checkpoint as a standard ONNX graph, and verify it against PyTorch.
 
     Views, height and width stay dynamic unless --views and --size make them static.
     """
@@ -60,13 +85,23 @@ def export(
                 views=views,
                 size=image_size,
                 precision=precision,
+                target=target,
+                opset=opset,
+                verify=not no_verify,
+                external_data=external_data,
+                calibrate=calibrate,
+                cameras=cameras,
+                hub=hub,
                 overwrite=overwrite,
             )
         except MismatchError as error:
             _print_errors(error, bool(verbose))
             warn(f"error: {error} (see the table)")
             raise SystemExit(MISMATCH) from None
-    _print_errors(result, bool(verbose))
+    if no_verify:
+        warn("warning: the graphs were not compared with PyTorch (--no-verify)")
+    else:
+        _print_errors(result, bool(verbose))
     _print_files(result)
 
 
@@ -110,7 +145,7 @@ def _print_files(result: ExportResult) -> None:
     """What was written, and how to use it."""
     say(*(f"wrote {path}" for path in result.files))
     graphs = [path for path in result.files if path.is_dir() or path.suffix == ".onnx"]
-    for weights in (path for path in result.files if path not in graphs):
+    for weights in (path for path in result.files if path.suffix == ".data"):
         say(f"{weights.name} holds the weights: move it along with {graphs[0].name}")
     makes = "Gaussians" if result.metadata.gaussians else "depth and a point cloud"
     for graph in graphs:

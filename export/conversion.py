@@ -16,7 +16,8 @@ from ..runtime.system.progress import progress, working
 from .existing_exports import replace_folder, working_folder
 from .graph.external_data import check_weights, publish, save_model
 from .stages import NamedTensors, Stage
-from .tracing import OPSET, Graphs, StaticShape, export_graphs
+from .targets import GraphSettings
+from .tracing import DEFAULT_SETTINGS, Graphs, StaticShape, export_graphs
 from .validation.compare import Exported, TensorError, verify
 
 logger = logging.getLogger(__name__)
@@ -56,7 +57,13 @@ def load(checkpoint: Path, preset: str | None) -> LoadedCheckpoint:
 
 
 def build_metadata(
-    model: Network, preset: str, checkpoint: str, digest: str, static: StaticShape, precision: str = "float32"
+    model: Network,
+    preset: str,
+    checkpoint: str,
+    digest: str,
+    static: StaticShape,
+    precision: str = "float32",
+    target: str = "cpu",
 ) -> ModelMetadata:
     """The metadata of a network's graphs. checkpoint, digest: the name and the SHA-256 of the file of its weights."""
     config = model.config
@@ -78,16 +85,23 @@ def build_metadata(
         version=version("idesplat"),
         gaussians=model.has_gaussians,
         precision=precision,
+        target=target,
     )
 
 
 def convert(
-    model: Network, metadata: ModelMetadata, static: StaticShape, out: Path | None, staged: Path | None
+    model: Network,
+    metadata: ModelMetadata,
+    static: StaticShape,
+    out: Path | None,
+    staged: Path | None,
+    settings: GraphSettings = DEFAULT_SETTINGS,
 ) -> tuple[list[TensorError], list[Path]]:
     """Trace, verify and write a network: the errors of every tensor in every case, and the files written.
 
-    If any error exceeds its bound, nothing is written and the files are none. The work is done in folders beside the
-    results, from where these are only moved: the system's folder for temporary files may lie in memory.
+    Without verification there are no errors. If any error exceeds its bound, nothing is written and the files are none.
+    The work is done in folders beside the results, from where these are only moved: the system's folder for temporary
+    files may lie in memory.
     """
     network = NamedTensors(model)
     with ExitStack() as stack:
@@ -95,14 +109,23 @@ def convert(
         folders = {parent: stack.enter_context(working_folder(parent)) for parent in parents}
         folder = next(iter(folders.values()))
         with working("tracing the network (a minute or so)"):
-            graphs = export_graphs(network, metadata, static, make_folder(folder / "graphs"))
-        logger.info("traced: %s nodes, opset %s, %.0f MB", graphs.nodes, OPSET, graphs.bytes / 1e6)
+            graphs = export_graphs(network, metadata, static, make_folder(folder / "graphs"), settings)
+        logger.info("traced: %s nodes, opset %s, %.0f MB", graphs.nodes, settings.opset, graphs.bytes / 1e6)
         logger.debug("stages: %s", ", ".join(stage.name for stage in graphs.stages))
-        fused = save_model(graphs.whole, make_folder(folders[out.parent] / "fused") / out.name) if out else []
+        external = settings.external_data
+        fused = []
+        if out is not None:
+            fused = save_model(graphs.whole, make_folder(folders[out.parent] / "fused") / out.name, external)
         new = make_folder(folders[staged.parent] / "staged") if staged else None
-        stages = _write_stages(graphs, new) if new else [(stage, graphs.of_stage(stage)) for stage in graphs.stages]
+        stages = (
+            _write_stages(graphs, new, external)
+            if new
+            else [(stage, graphs.of_stage(stage)) for stage in graphs.stages]
+        )
         exported = Exported(stages, staged is not None, fused[0] if fused else None)
-        errors = list(progress(verify(network, exported, metadata, static), "verifying against PyTorch"))
+        errors = []
+        if settings.verify:
+            errors = list(progress(verify(network, exported, metadata, static), "verifying against PyTorch"))
         if not all(error.passed for error in errors):
             return errors, []
         logger.debug("verified %d tensors, comparing the weights", len(errors))
@@ -118,12 +141,12 @@ def convert(
     return errors, files
 
 
-def _write_stages(graphs: Graphs, folder: Path) -> list[tuple[Stage, Path]]:
+def _write_stages(graphs: Graphs, folder: Path, external: bool) -> list[tuple[Stage, Path]]:
     """Write one graph a stage and the manifest into an empty folder; the stages, each with its graph."""
     files = [
         StageFile(stage.name, f"{stage.name}.onnx", list(stage.inputs), list(stage.outputs)) for stage in graphs.stages
     ]
     for stage, file in zip(graphs.stages, files, strict=True):
-        save_model(graphs.of_stage(stage), folder / file.file)
+        save_model(graphs.of_stage(stage), folder / file.file, external)
     write_manifest(folder, files)
     return [(stage, folder / file.file) for stage, file in zip(graphs.stages, files, strict=True)]

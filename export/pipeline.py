@@ -13,6 +13,7 @@ from ..runtime.inference.metadata import ModelMetadata
 from ..runtime.system.files import check_writable
 from ..runtime.system.outputs import Outputs
 from ..runtime.system.progress import ProgressCallback, reporting_to
+from .targets import GraphSettings, check_opset, parse_target
 
 if TYPE_CHECKING:
     from .tracing import StaticShape
@@ -28,8 +29,8 @@ MAX_PIXELS = 1 << 24
 class ExportResult:
     """What an export wrote.
 
-    files: the graph and, where it is too large for one file, its weights; then the staged folder.
-    errors: of every tensor in every verification case against PyTorch, with their bounds.
+    files: the graph and, where these are not in it, its weights; the staged folder; the files of a hub folder.
+    errors: of every tensor in every verification case against PyTorch, with their bounds; none without verification.
     """
 
     metadata: ModelMetadata
@@ -57,45 +58,82 @@ def export_checkpoint(
     views: int | None = None,
     size: tuple[int, int] | None = None,
     precision: str = "float32",
+    target: str = "cpu",
+    opset: int = 20,
+    verify: bool = True,
+    external_data: bool = False,
+    calibrate: Path | str | None = None,
+    cameras: Path | str | None = None,
+    hub: Path | str | None = None,
     overwrite: bool = False,
     progress: ProgressCallback | None = None,
 ) -> ExportResult:
-    """Write a checkpoint as a standard ONNX graph (opset 20), verified against PyTorch in ONNX Runtime.
+    """Write a checkpoint as a standard ONNX graph, verified against PyTorch in ONNX Runtime.
 
     checkpoint: `.ckpt`, `.pth` or `.safetensors`, a released file or one of idesplat-train.
-    out: the `.onnx` file. staged: a folder for one graph a stage, with a manifest; it is replaced as a whole. One of
-    the two is needed.
+    out: the `.onnx` file. hub: instead, a folder in the layout of model hubs, to which graphs of several exports can be
+    added. staged: a folder for one graph a stage, with a manifest; it is replaced as a whole. One of the three is
+    needed.
     preset: what the file was trained as, where its tensors and its name do not tell.
     views, size: make the number of views, or the image's height and width, static; else they stay dynamic.
-    precision: "float32", "int8" (for CPUs) or "fp16" (for GPUs).
+    precision: "float32", "int8" (for CPUs), "int8-qdq" (for TensorRT and QNN) or "fp16" (for GPUs).
+    target: "cpu", "gpu" or "web" (WebGPU); the last two have no Loop. opset: 17 to 21.
+    verify: compare the graphs with PyTorch. external_data: write the weights to a file of their own.
+    calibrate, cameras: images and their cameras, on which the ranges of int8 are found instead of noise and a synthetic
+    room.
     overwrite: also replace a file at `out` that idesplat did not write.
     progress: called as the work advances; by default reports go where the caller's `reporting_to` sends them.
     Raises InputError if an argument or the file is unusable, or PyTorch is not installed; MismatchError if a tensor's
     error exceeds its bound.
     """
     checkpoint = Path(checkpoint)
-    out, staged = (Path(path) if path is not None else None for path in (out, staged))
+    out, staged, hub, calibrate, cameras = (
+        Path(path) if path is not None else None for path in (out, staged, hub, calibrate, cameras)
+    )
+    chosen, checked_opset = parse_target(target), check_opset(opset)
+    if (calibrate is None) != (cameras is None):
+        raise InputError("--calibrate and --cameras belong together: images, and the file of their cameras")
     with reporting_to(progress) if progress else nullcontext(), Outputs(COMMAND, overwrite) as outputs:
+        require_pytorch()
+        _check_precision(precision, calibrate is not None)
+        if hub is not None:
+            out = _hub_graph(outputs, hub, out, precision, target)
         with _os_errors_as_input_errors("choose another name"):
             staged = staged.resolve() if staged is not None and staged.is_symlink() else staged
             outputs.reads("the checkpoint", [checkpoint])
             _check_targets(outputs, out, staged)
-        require_pytorch()
-        from . import conversion
-
-        _check_precision(precision)
-        with _os_errors_as_input_errors("choose another name"):
             _check_existing(outputs, out, staged)
+        from . import conversion
+        from .calibration_images import read_examples
+
         loaded = conversion.load(checkpoint, preset)
         static = _static_shape(views, size, loaded.model.config.size_multiple)
         metadata = conversion.build_metadata(
-            loaded.model, loaded.preset, checkpoint.name, loaded.sha256, static, precision
+            loaded.model, loaded.preset, checkpoint.name, loaded.sha256, static, precision, target
         )
+        examples = read_examples(calibrate, cameras, metadata) if calibrate and cameras else ()
+        settings = GraphSettings(chosen, checked_opset, verify, external_data, examples)
         with _os_errors_as_input_errors("choose a folder on a disk with room for it"):
-            errors, files = conversion.convert(loaded.model, metadata, static, out, staged)
+            errors, files = conversion.convert(loaded.model, metadata, static, out, staged, settings)
         if not files:
             raise MismatchError(errors)
+        if hub is not None:
+            from .hub import write_hub_files
+
+            files += write_hub_files(hub, metadata, verify)
     return ExportResult(metadata, files, errors)
+
+
+def _hub_graph(outputs: Outputs, hub: Path, out: Path | None, precision: str, target: str) -> Path:
+    """Where the graph of a hub folder goes; raises InputError if the folder's other files must not be written."""
+    from .hub import graph_path, hub_files
+
+    if out is not None:
+        raise InputError(f"{out}: with --hub the graph's name is given by its precision; leave it out")
+    if hub.exists() and not hub.is_dir():
+        raise InputError(f"--hub {hub}: is a file, expected a folder")
+    outputs.writes("--hub", hub_files(hub))
+    return graph_path(hub, precision, target)
 
 
 @contextmanager
@@ -118,7 +156,7 @@ def require_pytorch() -> None:
 def _check_targets(outputs: Outputs, out: Path | None, staged: Path | None) -> None:
     """Check, before minutes of work, whether the results can be written."""
     if out is None and staged is None:
-        raise InputError("nothing to write: give OUT.onnx, or --staged DIR, or both")
+        raise InputError("nothing to write: give OUT.onnx, or --staged DIR, or both, or --hub DIR")
     if out is not None:
         if out.suffix != ".onnx":
             raise InputError(f"{out}: the output must end in .onnx")
@@ -134,11 +172,13 @@ def _check_targets(outputs: Outputs, out: Path | None, staged: Path | None) -> N
         check_writable(staged.parent)
 
 
-def _check_precision(precision: str) -> None:
-    from .precision.convert import PRECISIONS
+def _check_precision(precision: str, calibrated: bool) -> None:
+    from .precision.convert import INT8, INT8_QDQ, PRECISIONS
 
     if precision not in PRECISIONS:
         raise InputError(f"--precision {precision}: unknown; choose one of {', '.join(PRECISIONS)}")
+    if calibrated and precision not in (INT8, INT8_QDQ):
+        raise InputError(f"--calibrate: {precision} has no ranges to find; use it with --precision int8 or int8-qdq")
 
 
 def _check_existing(outputs: Outputs, out: Path | None, staged: Path | None) -> None:

@@ -8,19 +8,27 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import onnx
+import sympy
 import torch
 
 from ..runtime.inference.metadata import INPUTS, METADATA_KEY, OUTPUTS, ModelMetadata
 from .example_inputs import example_inputs, room_inputs
 from .graph.cleanup import simplify
 from .graph.external_data import fill_inputs
+from .graph.fold_shapes import declare_shapes, fold_shapes
+from .graph.fuse import fuse_nodes
 from .graph.gather_loops import chunked, lower_custom_ops
+from .graph.symbolic_shapes import SymbolicShapes
+from .graph.unroll import unroll_loops
+from .graph.webgpu import pad_channels, replace_rounding
 from .precision.convert import convert_precision
 from .precision.int8 import Feeds
 from .stages import NamedTensors, Stage, find_stages, stage_graph
+from .targets import MAX_TRACED_OPSET, OPSET, WEB, GraphSettings
 
-OPSET = 20
+# Of opset 20 and later; earlier opsets, which are for older runtimes, have the least that fits them.
 IR_VERSION = 10
+DEFAULT_SETTINGS = GraphSettings()
 # Numbers of views and blocks that differ from every constant in the network; the graph is dynamic in all of them.
 TRACE_VIEWS = 4
 TRACE_BLOCKS = (6, 8)
@@ -70,17 +78,74 @@ class Graphs:
         return self.folder / f"stage.{stage.name}.onnx"
 
 
-def export_graphs(network: NamedTensors, metadata: ModelMetadata, static: StaticShape, folder: Path) -> Graphs:
+def export_graphs(
+    network: NamedTensors,
+    metadata: ModelMetadata,
+    static: StaticShape,
+    folder: Path,
+    settings: GraphSettings = DEFAULT_SETTINGS,
+) -> Graphs:
     """Trace a network and split it into stages: files in an empty folder, checked by ONNX's checker."""
-    traced = trace(network, metadata, static, folder)
-    layers, examples = network.family.quantizable, _examples(metadata, static)
+    dims = _Dimensions.of(metadata, static)
+    traced = trace(network, metadata, static, folder, min(settings.opset, MAX_TRACED_OPSET))
+    traced.opset_import[0].version = settings.opset
+    known = dims.infer(traced)
+    fuse_nodes(traced, known)
+    if settings.target.gather_bytes is not None:
+        unroll_loops(traced, known, settings.target.gather_bytes, dims.sizes)
+        replace_rounding(traced)
+    if settings.target.name == WEB:
+        pad_channels(traced, folder)
+    layers = network.family.quantizable
+    examples = settings.calibration or _examples(metadata, static)
     traced = convert_precision(metadata.precision, traced, folder / WEIGHTS, layers, examples)
+    known = dims.infer(traced)
     whole = _whole_graph(traced)
+    _fold(whole, known, dims)
     graphs = Graphs(folder, find_stages(traced, network.stages), len(whole.graph.node))
     _write(whole, metadata, graphs.whole)
     for stage in graphs.stages:
-        _write(stage_graph(traced, stage), metadata, graphs.of_stage(stage))
+        part = stage_graph(traced, stage)
+        _fold(part, known, dims)
+        _write(part, metadata, graphs.of_stage(stage))
     return graphs
+
+
+@dataclass(frozen=True)
+class _Dimensions:
+    """The inputs' dimensions as expressions.
+
+    inputs: by name. names: the symbols in terms of the declared dimensions. sizes: the trained size and most views.
+    """
+
+    inputs: dict[str, tuple[sympy.Expr | int, ...]]
+    names: dict[sympy.Symbol, sympy.Expr]
+    sizes: dict[sympy.Symbol, int]
+
+    @classmethod
+    def of(cls, metadata: ModelMetadata, static: StaticShape) -> "_Dimensions":
+        """Of a model: height and width are multiples of `size_multiple`."""
+        multiple = metadata.size_multiple
+        symbols = [sympy.Symbol(name, integer=True, positive=True) for name in ("views", "rows", "columns")]
+        views: sympy.Expr | int = static.views or symbols[0]
+        height, width = static.size or (multiple * symbols[1], multiple * symbols[2])
+        shapes = ((views, 3, height, width), (views, 4, 4), (views, 3, 3), (views,), (views,))
+        names = {symbols[1]: sympy.Symbol("height") / multiple, symbols[2]: sympy.Symbol("width") / multiple}
+        trained = (metadata.trained_views[-1], metadata.height // multiple, metadata.width // multiple)
+        return cls(dict(zip(INPUTS, shapes, strict=True)), names, dict(zip(symbols, map(int, trained), strict=True)))
+
+    def infer(self, model: onnx.ModelProto) -> SymbolicShapes:
+        """The shapes of a graph of the whole network."""
+        known = SymbolicShapes()
+        known.infer(model.graph, self.inputs)
+        return known
+
+
+def _fold(model: onnx.ModelProto, known: SymbolicShapes, dims: _Dimensions) -> None:
+    """Fold a graph's shape arithmetic, and declare the shapes of its tensors."""
+    own = known.copy()
+    fold_shapes(model, own, [value.name for value in model.graph.input])
+    declare_shapes(model, own, dims.names)
 
 
 def _examples(metadata: ModelMetadata, static: StaticShape) -> Iterator[Feeds]:
@@ -92,7 +157,9 @@ def _examples(metadata: ModelMetadata, static: StaticShape) -> Iterator[Feeds]:
             yield {name: tensor.numpy() for name, tensor in inputs.items()}
 
 
-def trace(network: NamedTensors, metadata: ModelMetadata, static: StaticShape, folder: Path) -> onnx.ModelProto:
+def trace(
+    network: NamedTensors, metadata: ModelMetadata, static: StaticShape, folder: Path, opset: int = OPSET
+) -> onnx.ModelProto:
     """Trace the network with every tensor between stages as an output; its weights go to a file in the folder.
 
     torch.onnx's TorchScript exporter is used because with dynamic views, height and width torch.export 2.13 spends
@@ -116,12 +183,12 @@ def trace(network: NamedTensors, metadata: ModelMetadata, static: StaticShape, f
             dynamo=False,
             export_params=False,
             do_constant_folding=False,  # folded weights lose their names; `simplify` folds them later
-            opset_version=OPSET,
+            opset_version=opset,
             input_names=list(INPUTS),
             output_names=list(shapes),
             dynamic_axes=axes,
         )
-    traced = lower_custom_ops(onnx.load(path))
+    traced = lower_custom_ops(onnx.load(path), opset)
     fill_inputs(traced, [*network.named_parameters(), *network.named_buffers()], weights)
     path.write_bytes(traced.SerializeToString())
     model = simplify(path, folder / WEIGHTS)
@@ -169,7 +236,8 @@ def _whole_graph(traced: onnx.ModelProto) -> onnx.ModelProto:
 
 def _write(model: onnx.ModelProto, metadata: ModelMetadata, path: Path) -> None:
     """Add the metadata to a graph, and save and check it."""
-    model.ir_version = IR_VERSION
+    opset = model.opset_import[0].version
+    model.ir_version = IR_VERSION if opset >= OPSET else onnx.helper.find_min_ir_version_for(model.opset_import)
     model.producer_name, model.producer_version = PRODUCER, metadata.version
     model.doc_string = f"{metadata.preset} exported by idesplat {metadata.version}"
     del model.metadata_props[:]

@@ -76,5 +76,5 @@ class Family:
     # A checkpoint's tensors -> the same by this project's names.
     rename_released: Callable[[dict[str, Tensor]], dict[str, Tensor]]
     quantizable: QuantizableLayers
-    # By precision: float32, fp16, int8.
+    # By precision: float32, fp16, int8, int8-qdq.
     tolerances: Mapping[str, Tolerance]

@@ -174,18 +174,24 @@ def scene(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def browser():
-    """Headless Chromium, which renders WebGL on the CPU."""
+def chromium():
+    """Starts headless Chromium with further flags: a function that returns the browser, which its caller closes."""
     path = shutil.which("chromium") or shutil.which("google-chrome")
     if path is None:
         pytest.skip("neither chromium nor google-chrome is installed")
     from playwright.sync_api import sync_playwright
 
-    flags = (
+    usual = (
         "--no-sandbox --disable-quic --no-first-run --disable-background-networking --disable-component-update "
-        "--disable-sync --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader --hide-scrollbars"
+        "--disable-sync --hide-scrollbars"
     )
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=flags.split())
-        yield browser
-        browser.close()
+        yield lambda flags: playwright.chromium.launch(executable_path=path, args=f"{usual} {flags}".split())
+
+
+@pytest.fixture(scope="session")
+def browser(chromium):
+    """Headless Chromium, which renders WebGL on the CPU."""
+    browser = chromium("--use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader")
+    yield browser
+    browser.close()

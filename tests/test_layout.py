@@ -28,8 +28,8 @@ ORDERS = {
     ),
     "model": ("config", "common", "family", "idesplat", "depthsplat", "registry", "checkpoint"),
     "export": (
-        *("existing_exports", "graph", "stages", "example_inputs", "precision", "tracing", "validation"),
-        *("conversion", "pipeline", "released", "cli"),
+        *("existing_exports", "targets", "graph", "stages", "example_inputs", "precision", "tracing", "validation"),
+        *("conversion", "calibration_images", "hub", "pipeline", "released", "cli"),
     ),
     "tools": ("processes", "synthetic", "training", "evaluation", "benchmark", "figures"),
 }

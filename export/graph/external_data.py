@@ -31,15 +31,17 @@ def fill_inputs(model: onnx.ModelProto, weights: Iterable[tuple[str, Tensor]], p
                 model.graph.input.remove(inputs[name])
 
 
-def save_model(graph: Path, out: Path) -> list[Path]:
+def save_model(graph: Path, out: Path, external: bool = False) -> list[Path]:
     """Write a graph with external weights to a new file that holds the weights, too, unless that makes it too large.
 
-    Returns the paths written: `out` and, for a large model, the file of its weights, which is named after its content
-    and must stay in the same folder.
+    external: keep the weights in a file of their own whatever their size.
+
+    Returns the paths written: `out` and, unless they are in it, the file of its weights, which is named after its
+    content and must stay in the same folder.
     """
     model = onnx.load(graph, load_external_data=False)
     size = model.ByteSize() + sum(ExternalDataInfo(tensor).length or 0 for tensor in _outside(model))
-    if size <= LARGEST_FILE:
+    if size <= LARGEST_FILE and not external:
         for tensor in _outside(model):
             tensor.raw_data = _values(tensor, graph.parent)
             tensor.ClearField("external_data")

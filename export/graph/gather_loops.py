@@ -60,18 +60,22 @@ GATHERED_WEIGHTED_SUM = """gathered_weighted_sum <step> (probability, table, row
         sums_shape = Concat <axis = 0> (all, pixels, channels)
         sums = Reshape (products, sums_shape)
     }}""".format(steps=STEPS.format(shape="one, candidates", by_pixel="weights", product="some, gathered"))
-FUNCTIONS = tuple(
-    f'<domain: "{DOMAIN}", opset_import: ["": 20]> {text}' for text in (GATHERED_DOT, GATHERED_WEIGHTED_SUM)
-)
 
 
 @contextmanager
 def chunked(network: nn.Module) -> Iterator[None]:
-    """Within this context, a network's gather attention is traced as custom nodes, for `lower_custom_ops`."""
-    modules = [part for part in network.modules() if isinstance(part, GatherAttention) and part.gathers >= FEW]
+    """Within this context, a network's gather attention is traced as custom nodes, for `lower_custom_ops`.
+
+    Where few values are gathered a pixel, it is traced as it is, with all candidates at once.
+    """
+    modules = [part for part in network.modules() if isinstance(part, GatherAttention)]
     for part in modules:
-        part.gathered_dot = partial(_GatheredDot.apply, part.block)
-        part.gathered_weighted_sum = partial(_GatheredWeightedSum.apply, part.block)
+        if part.gathers < FEW:
+            part.gathered_dot = partial(gathered_dot, chunk=FEW)
+            part.gathered_weighted_sum = partial(gathered_weighted_sum, chunk=FEW)
+        else:
+            part.gathered_dot = partial(_GatheredDot.apply, part.block)
+            part.gathered_weighted_sum = partial(_GatheredWeightedSum.apply, part.block)
     try:
         yield
     finally:
@@ -79,10 +83,12 @@ def chunked(network: nn.Module) -> Iterator[None]:
             part.gathered_dot, part.gathered_weighted_sum = gathered_dot, gathered_weighted_sum
 
 
-def lower_custom_ops(traced: onnx.ModelProto) -> onnx.ModelProto:
-    """The graph with standard operators in place of the custom nodes of `chunked`, named after these."""
+def lower_custom_ops(traced: onnx.ModelProto, opset: int = 20) -> onnx.ModelProto:
+    """The graph of this opset with standard operators in place of the custom nodes of `chunked`, named after these."""
     products = {node.output[0]: node.name for node in traced.graph.node if node.domain == DOMAIN}
-    traced.functions.extend(onnx.parser.parse_function(function) for function in FUNCTIONS)
+    header = f'<domain: "{DOMAIN}", opset_import: ["": {opset}]>'
+    for text in (GATHERED_DOT, GATHERED_WEIGHTED_SUM):
+        traced.functions.append(onnx.parser.parse_function(f"{header} {text}"))
     model = onnx.inliner.inline_local_functions(traced)
     name = ""
     for node in reversed(model.graph.node):  # the output is that of the last of a function's nodes

@@ -43,6 +43,23 @@ def replace_nodes(graph: onnx.GraphProto, nodes: list[onnx.NodeProto]) -> None:
     graph.initializer.extend(kept)
 
 
+def remove_unread(graph: onnx.GraphProto) -> None:
+    """Remove nodes, and weights, that no output depends on; nodes may be in any order."""
+    producers = {name: index for index, node in enumerate(graph.node) for name in node.output}
+    pending, read, kept = [output.name for output in graph.output], set(), set()
+    while pending:
+        name = pending.pop()
+        read.add(name)
+        if name in producers and producers[name] not in kept:
+            kept.add(producers[name])
+            pending.extend(names_read(graph.node[producers[name]]))
+    nodes = [node for index, node in enumerate(graph.node) if index in kept]
+    weights = [weight for weight in graph.initializer if weight.name in read]
+    del graph.node[:], graph.initializer[:]
+    graph.node.extend(nodes)
+    graph.initializer.extend(weights)
+
+
 def sort_nodes(graph: onnx.GraphProto) -> None:
     """Sort nodes topologically: ONNX Runtime's tools ignore what is read inside a Loop."""
     producers = {name: index for index, node in enumerate(graph.node) for name in node.output}

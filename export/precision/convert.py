@@ -1,4 +1,4 @@
-"""Conversion of a traced graph to a lower precision: int8 for CPUs, fp16 for GPUs.
+"""Conversion of a traced graph to a lower precision: int8 for CPUs, fp16 and int8-qdq for GPUs and NPUs.
 
 Each network family says which layers may be converted (`QuantizableLayers` of model/family.py); all others stay in
 float32.
@@ -13,8 +13,9 @@ from ...model.family import QuantizableLayers
 from ..graph.subgraph import sort_nodes
 from .fp16 import in_fp16
 from .int8 import Feeds, in_int8
+from .int8_qdq import in_int8_qdq
 
-FLOAT32, INT8, FP16 = PRECISIONS = ("float32", "int8", "fp16")
+FLOAT32, INT8, INT8_QDQ, FP16 = PRECISIONS = ("float32", "int8", "int8-qdq", "fp16")
 # Smaller tensors stay in the graph's file.
 SMALL_TENSOR = 1024  # bytes
 
@@ -34,6 +35,8 @@ def convert_precision(
     chosen = [node for node in graph.graph.node if is_quantizable(node, layers)]
     if precision == INT8:
         made = in_int8(source, graph, chosen, examples)
+    elif precision == INT8_QDQ:
+        made = in_int8_qdq(source, graph, chosen, examples)
     else:
         made = in_fp16(onnx.load(source), {node.name for node in chosen})
     sort_nodes(made.graph)

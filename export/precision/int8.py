@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ LANES = 4
 # Operators that only move or repeat values, those of their first input (Concat: of all inputs).
 MOVING = ("Concat", "Pad")
 
-Feeds = dict[str, np.ndarray]
+Feeds = Mapping[str, np.ndarray]
 Ranges = dict[str, tuple[float, float]]
 
 
@@ -39,7 +39,7 @@ def in_int8(
         node for node in weighted if node.op_type == "Conv" and math.prod(shapes[node.input[1]][1:]) >= FEW_TERMS
     ]
     tensors = {name for node in convolutions for name in (node.input[0], node.output[0])}
-    ranges = _ranges(source, graph, sorted(tensors), examples)
+    ranges = find_ranges(source, graph, sorted(tensors), examples)
     dynamic = source.with_name("dynamic.onnx")
     logging.disable(logging.WARNING)  # it advises to prepare the graph, which `simplify` has done
     try:
@@ -57,7 +57,7 @@ def in_int8(
     return _Convolutions(onnx.load(dynamic), {node.name for node in convolutions}, ranges).converted()
 
 
-def _ranges(source: Path, graph: onnx.ModelProto, tensors: Iterable[str], examples: Iterable[Feeds]) -> Ranges:
+def find_ranges(source: Path, graph: onnx.ModelProto, tensors: Iterable[str], examples: Iterable[Feeds]) -> Ranges:
     """The smallest and the largest value of each tensor on the examples; the range always contains zero."""
     watched = onnx.ModelProto()
     watched.CopyFrom(graph)
@@ -71,7 +71,7 @@ def _ranges(source: Path, graph: onnx.ModelProto, tensors: Iterable[str], exampl
     path.write_bytes(watched.SerializeToString())
     session = open_session(path)
     for feeds in examples:
-        found = run_session(session, feeds)
+        found = run_session(session, dict(feeds))
         for name, (low, high) in ranges.items():
             bounds = float(found[f"{name}.ReduceMin"]), float(found[f"{name}.ReduceMax"])
             ranges[name] = min(low, bounds[0]), max(high, bounds[1])

@@ -25,8 +25,8 @@ class Attention(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """[n, tokens, dim] -> the same shape."""
-        qkv = self.qkv(x).reshape(x.shape[0], -1, 3, self.heads, self.head_channels).permute(2, 0, 3, 1, 4)
-        q, k, v = qkv.unbind(0)  # [n, heads, tokens, dim / heads]
+        qkv = self.qkv(x).reshape(x.shape[0], -1, 3 * self.heads, self.head_channels).transpose(1, 2)
+        q, k, v = qkv.split(self.heads, dim=1)  # [n, heads, tokens, dim / heads]
         return self.proj(attention(q, k, v).transpose(1, 2).reshape(x.shape[0], -1, self.heads * self.head_channels))
 
 
@@ -98,12 +98,10 @@ def _cubic_weights(out_size: int, in_size: int, offset: Tensor, like: Tensor) ->
     position = (steps + 0.5) * (in_size / (like.new_ones(out_size).sum() + offset)) - 0.5
     base = position.floor()
     columns = torch.arange(in_size, device=like.device).to(like.dtype)
-    weights = torch.zeros_like(position)[:, None] * columns
-    for shift in (-1, 0, 1, 2):
-        distance = (position - base - shift).abs()
-        near = ((CUBIC + 2) * distance - (CUBIC + 3)) * distance**2 + 1
-        far = ((CUBIC * distance - 5 * CUBIC) * distance + 8 * CUBIC) * distance - 4 * CUBIC
-        weight = torch.where(distance <= 1, near, far)
-        source = (base + shift).clamp(0, in_size - 1)
-        weights = weights + weight[:, None] * (source[:, None] == columns).to(like.dtype)
-    return weights
+    shifts = torch.arange(-1, 3, device=like.device).to(like.dtype)
+    distance = ((position - base)[:, None] - shifts).abs()  # [out_size, 4]
+    near = ((CUBIC + 2) * distance - (CUBIC + 3)) * distance**2 + 1
+    far = ((CUBIC * distance - 5 * CUBIC) * distance + 8 * CUBIC) * distance - 4 * CUBIC
+    weight = torch.where(distance <= 1, near, far)
+    source = (base[:, None] + shifts).clamp(0, in_size - 1)
+    return (weight[..., None] * (source[..., None] == columns).to(like.dtype)).sum(1)

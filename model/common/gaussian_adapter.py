@@ -64,7 +64,7 @@ class GaussianAdapter(nn.Module):
         if self.in_pixels:
             scales = scales * self._pixel_sizes(depth, cameras)
         camera = cameras.extrinsics[:, :3, :3]
-        quats = quaternion_product(matrices_to_quaternions(camera)[:, None], _normalise_quaternion(rotations))
+        quats = quaternion_product(matrices_to_quaternions(camera), _normalise_quaternion(rotations))
         sh = self._world_sh(sh.unflatten(1, (3, self.coefficients)), (images.flatten(2) - 0.5) / SH_0, camera)
         gaussians = WorldGaussians(means, scales, quats, logits.sigmoid()[..., 0], sh)
         return WorldGaussians(*(x.flatten(0, 1) for x in gaussians))

@@ -128,8 +128,17 @@ def warp_indices(inverse_depth: Tensor, intrinsics: Tensor, extrinsics: Tensor, 
         x, y, valid = project_candidates(inverse_depth, intrinsics, extrinsics, neighbours)
         valid = valid & (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
         pixel = (y.round() * width + x.round()).to(torch.int32)
-        first = (neighbours.flatten() * (height * width)).to(torch.int32)
+        first = first_rows(neighbours, views, height * width)
         return torch.where(valid, pixel + first[:, None, None], views * height * width)
+
+
+def first_rows(neighbours: Tensor, views: int, pixels: int) -> Tensor:
+    """The first row of each neighbour in a table of the pixels of all views: int32 [views * n].
+
+    Looked up, not multiplied: WebGPU cannot compute with the int64 of indices.
+    """
+    rows = torch.arange(views, device=neighbours.device).to(torch.int32) * pixels
+    return rows[neighbours].flatten()
 
 
 def sampling_points(

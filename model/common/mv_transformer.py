@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from .layers import attention
+from .layers import attention, static_dim
 from .windows import Regions, join_windows, split_windows
 
 POSITION_TEMPERATURE = 10000.0
@@ -78,17 +78,20 @@ class WindowAttention(nn.Module):
 
         With regions (of windows that were shifted), tokens attend within these alone.
         """
-        q, k, v = self.q_proj(source), self.k_proj(target), self.v_proj(target)
+        channels = static_dim(source.shape[-1])
+        q = self.q_proj(source)
+        # Keys and values side by side, so that an exported graph rearranges them once.
+        kv = F.linear(target, torch.cat([self.k_proj.weight, self.v_proj.weight]))
         if neighbours is not None:
             # The windows of all neighbours as one sequence [views, windows, tokens * n, channels], neighbours fastest.
             # The releases repeat the mask of regions over it as if neighbours were slowest, so that with two neighbours
             # or more a region is masked with other tokens' regions. The weights were trained with that.
-            k, v = (x[neighbours].permute(0, 2, 3, 1, 4).flatten(2, 3) for x in (k, v))
+            kv = kv[neighbours].permute(0, 2, 3, 1, 4).flatten(2, 3)
         if regions is None:
-            message = attention(q, k, v)
+            message = attention(q, *kv.split(channels, dim=-1))
         else:
-            groups = zip(*(regions.split(x) for x in (q, k, v)), strict=True)
-            message = regions.join([attention(*group) for group in groups])
+            groups = zip(regions.split(q), regions.split(kv), strict=True)
+            message = regions.join([attention(queries, *both.split(channels, dim=-1)) for queries, both in groups])
         return self.norm(self.merge(message))
 
 

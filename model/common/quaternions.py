@@ -3,36 +3,45 @@
 import torch
 from torch import Tensor
 
+# The product's component i is the sum of SIGNS[i][j] a[PARTNERS[i][j]] b[j].
+PARTNERS = ((0, 1, 2, 3), (1, 0, 3, 2), (2, 3, 0, 1), (3, 2, 1, 0))
+SIGNS = ((1, -1, -1, -1), (1, 1, -1, 1), (1, 1, 1, -1), (1, -1, 1, 1))
+# 4 q_i q_j of a rotation's quaternion is 1 (where i = j) plus a sum of the matrix's nine entries, row by row.
+ENTRIES = (
+    *((1, 0, 0, 0, 1, 0, 0, 0, 1), (0, 0, 0, 0, 0, -1, 0, 1, 0), (0, 0, 1, 0, 0, 0, -1, 0, 0)),
+    *((0, -1, 0, 1, 0, 0, 0, 0, 0), (0, 0, 0, 0, 0, -1, 0, 1, 0), (1, 0, 0, 0, -1, 0, 0, 0, -1)),
+    *((0, 1, 0, 1, 0, 0, 0, 0, 0), (0, 0, 1, 0, 0, 0, 1, 0, 0), (0, 0, 1, 0, 0, 0, -1, 0, 0)),
+    *((0, 1, 0, 1, 0, 0, 0, 0, 0), (-1, 0, 0, 0, 1, 0, 0, 0, -1), (0, 0, 0, 0, 0, 1, 0, 1, 0)),
+    *((0, -1, 0, 1, 0, 0, 0, 0, 0), (0, 0, 1, 0, 0, 0, 1, 0, 0), (0, 0, 0, 0, 0, 1, 0, 1, 0)),
+    (-1, 0, 0, 0, -1, 0, 0, 0, 1),
+)
+
 
 def quaternion_product(a: Tensor, b: Tensor) -> Tensor:
-    """The rotation b followed by a, all wxyz [..., 4]."""
-    aw, ax, ay, az = a.unbind(-1)
-    bw, bx, by, bz = b.unbind(-1)
-    product = [
-        aw * bw - ax * bx - ay * by - az * bz,
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-    ]
-    return torch.stack(product, dim=-1)
+    """The rotations b [views, n, 4] followed by a [views, 4], all wxyz: [views, n, 4].
+
+    A matrix product: component by component it would be forty nodes of a graph.
+    """
+    signs = torch.tensor(SIGNS, dtype=a.dtype, device=a.device)
+    left = torch.stack([a[:, list(row)] for row in PARTNERS], dim=1) * signs  # [views, 4, 4]
+    return b @ left.transpose(1, 2)
 
 
 def matrices_to_quaternions(rotation: Tensor) -> Tensor:
     """Rotations [views, 3, 3] -> unit quaternions wxyz [views, 4].
 
     Row i of `candidates` is 4 q_i q, whose diagonal is 4 q_i^2. The row with the largest q_i is normalised; its length
-    is never small (Shepperd's method).
+    is never small (Shepperd's method). It is chosen by comparisons: WebGPU cannot compute with an index.
     """
-    m00, m01, m02, m10, m11, m12, m20, m21, m22 = rotation.flatten(-2).unbind(-1)
-    candidates = [
-        [1 + m00 + m11 + m22, m21 - m12, m02 - m20, m10 - m01],
-        [m21 - m12, 1 + m00 - m11 - m22, m10 + m01, m02 + m20],
-        [m02 - m20, m10 + m01, 1 - m00 + m11 - m22, m21 + m12],
-        [m10 - m01, m02 + m20, m21 + m12, 1 - m00 - m11 + m22],
-    ]
-    stacked = torch.stack([torch.stack(row, dim=-1) for row in candidates], dim=-2)  # [views, 4, 4]
-    best = torch.stack([candidates[i][i] for i in range(4)], dim=-1).argmax(-1)  # [views]
-    chosen = stacked.gather(-2, best[:, None, None].expand(-1, 1, 4))[:, 0]
+    entries = torch.tensor(ENTRIES, dtype=rotation.dtype, device=rotation.device)
+    ones = torch.eye(4, dtype=rotation.dtype, device=rotation.device)
+    candidates = (rotation.flatten(-2) @ entries.T).unflatten(-1, (4, 4)) + ones  # [views, 4, 4]
+    chosen, *others = candidates.unbind(1)
+    largest = chosen[:, :1]
+    for index, candidate in enumerate(others, 1):
+        size = candidate[:, index : index + 1]
+        chosen = torch.where(size > largest, candidate, chosen)
+        largest = torch.maximum(largest, size)
     return chosen / chosen.norm(dim=-1, keepdim=True)
 
 

@@ -45,8 +45,8 @@ class CrossViewAttention(nn.Module):
         height, width = x.shape[2:]
         pixels = height * width
         qkv = self.qkv(self.norm(x.flatten(2)))  # [groups * views, 3 * channels, pixels]
-        qkv = qkv.reshape(-1, views, self.heads, 3, self.head_channels, pixels).permute(3, 0, 2, 1, 5, 4)
-        q, k, v = qkv.reshape(3, -1, self.heads, views * pixels, self.head_channels).unbind(0)
+        qkv = qkv.reshape(-1, views, self.heads, 3, self.head_channels, pixels).permute(0, 3, 2, 1, 5, 4)
+        q, k, v = qkv.reshape(-1, 3 * self.heads, views * pixels, self.head_channels).split(self.heads, dim=1)
         out = attention(q, k, v)  # [groups, heads, views * pixels, channels / heads]
         out = out.reshape(-1, self.heads, views, pixels, self.head_channels).permute(0, 2, 1, 4, 3)
         out = out.reshape(-1, self.heads * self.head_channels, pixels)  # [groups * views, channels, pixels]

@@ -60,15 +60,18 @@ class Regions(NamedTuple):
         """[n, windows, m * rows * columns, channels] -> four groups [regions, m * tokens of a region, channels]."""
         channels = static_dim(windows.shape[3])
         grid = windows.reshape(-1, self.splits, self.splits, windows.shape[2], channels)
+        quarters = [part for rows in self._whole_and_halved(grid, 1) for part in self._whole_and_halved(rows, 2)]
         groups = []
-        for down, right in HALVES:
-            part = grid[:, -1:] if down > 1 else grid[:, :-1]
-            part = part[:, :, -1:] if right > 1 else part[:, :, :-1]
+        for (down, right), part in zip(HALVES, quarters, strict=True):
             rows, across = self.rows // down, self.columns // right * channels
             part = part.reshape(-1, windows.shape[2] // (self.rows * self.columns), down, rows, right, across)
             regions = part.permute(0, 2, 4, 1, 3, 5)
             groups.append(regions.reshape(-1, windows.shape[2] // (down * right), channels))
         return groups
+
+    def _whole_and_halved(self, grid: Tensor, dim: int) -> tuple[Tensor, ...]:
+        """The windows along an axis that stay whole, and the last."""
+        return grid.split((self.splits - 1, 1), dim=dim)
 
     def join(self, groups: Sequence[Tensor]) -> Tensor:
         """The inverse of `split`, for m = 1."""

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ..common.bilinear import bordered, corners_around, interpolate
 from ..common.gather_attention import GatherAttention
-from ..common.geometry import Cameras, denormalize_intrinsics, sampling_points
+from ..common.geometry import Cameras, denormalize_intrinsics, first_rows, sampling_points
 from ..common.layers import repeat_views, static_dim, to_tokens
 
 CORNERS = 4  # pixels around a point
@@ -58,7 +58,7 @@ def by_gathering(
     """The same from the correlations with the four pixels around x and y."""
     own = repeat_views(to_tokens(features), neighbours.shape[1])  # [pairs, h * w, channels]
     table = to_tokens(bordered(features))  # [views, bordered pixels, channels]
-    first = (neighbours.flatten() * table.shape[1]).to(torch.int32)[:, None, None]
+    first = first_rows(neighbours, features.shape[0], table.shape[1])[:, None, None]
     corners, across, down = corners_around(x, y, *features.shape[2:])
     rows = torch.cat([first + corner for corner in corners], dim=1)  # [pairs, 4 * candidates, h * w]
     scores = gather_attention.gathered_dot(own, table.flatten(0, 1), rows)

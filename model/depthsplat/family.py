@@ -32,5 +32,6 @@ DEPTHSPLAT = Family(
         "float32": Tolerance(encoder=_STAGE, stage=_STAGE, end_to_end=ErrorQuantiles(1e-3, 1e-2, 5e-2)),
         "fp16": FP16_TOLERANCE,
         "int8": INT8_TOLERANCE,
+        "int8-qdq": INT8_TOLERANCE,
     },
 )

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..common.bilinear import bordered, corners_around, interpolate
-from ..common.geometry import Cameras, denormalize_intrinsics, project_points
+from ..common.geometry import Cameras, denormalize_intrinsics, first_rows, project_points
 from ..common.layers import repeat_views, to_tokens
 
 # Relative difference of inverse depth at which the agreement is one half.
@@ -61,7 +61,7 @@ def _sample(maps: Tensor, neighbours: Tensor, x: Tensor, y: Tensor) -> Tensor:
     """Maps [views, channels, H, W] of the neighbours, bilinearly at x and y [views * n, 1, H * W], zero outside."""
     height, width = maps.shape[2:]
     table = to_tokens(bordered(maps))  # [views, bordered pixels, channels]
-    first = (neighbours.flatten() * table.shape[1]).to(torch.int32)[:, None]
+    first = first_rows(neighbours, maps.shape[0], table.shape[1])[:, None]
     corners, across, down = corners_around(x[:, 0], y[:, 0], height, width)
     rows = table.flatten(0, 1)
     around = [F.embedding(first + corner, rows) for corner in corners]  # each [pairs, H * W, channels]

@@ -36,5 +36,6 @@ IDESPLAT = Family(
         ),
         "fp16": replace(FP16_TOLERANCE, scale_free=SCALE_FREE),
         "int8": replace(INT8_TOLERANCE, scale_free=SCALE_FREE),
+        "int8-qdq": replace(INT8_TOLERANCE, scale_free=SCALE_FREE),
     },
 )

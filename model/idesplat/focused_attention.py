@@ -12,7 +12,7 @@ renormalisation, as in the released code.
 import torch
 from torch import Tensor, nn
 
-from ..common.layers import ConvFFN, DepthwiseConv, to_map, to_tokens
+from ..common.layers import ConvFFN, DepthwiseConv, static_dim, to_map, to_tokens
 from ..common.windows import join_windows, region_mask, split_windows
 from .config import FocusConfig
 
@@ -82,7 +82,7 @@ class FocusedLayer(nn.Module):
         normed = self.norm1(tokens)
         value = self.v_proj(normed)
         parts = [self.q_proj(normed), self.k_proj(normed), value, self.v_depthwise(value, height, width)]
-        q, k, v, local = (self._split(part, height, width) for part in parts)
+        q, k, v, local = self._split(torch.cat(parts, dim=-1), height, width).split(self.heads, dim=2)
         attention = self._attend(q, k, before, mask)
         tokens = tokens + self.proj(self._join(attention @ v + local, height, width))
         tokens = tokens + self.ffn(self.norm2(tokens), height, width)
@@ -110,10 +110,15 @@ class FocusedLayer(nn.Module):
         return attention
 
     def _split(self, tokens: Tensor, height: int, width: int) -> Tensor:
-        """[views, h * w, channels] -> [views, windows, heads, tokens, channels / heads], shifted in odd layers."""
-        image = tokens.reshape(-1, height, width, self.heads * self.head_channels)
+        """[views, h * w, channels] -> [views, windows, heads, tokens, head channels], shifted in odd layers.
+
+        With the channels of several tensors, the heads are those of all.
+        """
+        channels = static_dim(tokens.shape[2])
+        image = tokens.reshape(-1, height, width, channels)
         windows = split_windows(image, self.window, self.window, self.shifted)
-        return windows.reshape(tokens.shape[0], -1, self.window**2, self.heads, self.head_channels).transpose(2, 3)
+        heads = channels // self.head_channels
+        return windows.reshape(tokens.shape[0], -1, self.window**2, heads, self.head_channels).transpose(2, 3)
 
     def _join(self, windows: Tensor, height: int, width: int) -> Tensor:
         """The inverse of `_split`."""

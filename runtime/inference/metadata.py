@@ -55,6 +55,8 @@ class ModelMetadata:
     gaussians: bool = True
     # float32, int8 or fp16, for the layers that tolerate it. Inputs, outputs and geometry are always float32.
     precision: str = "float32"
+    # cpu, gpu or web: what the graph's operators were chosen for. Every graph runs everywhere.
+    target: str = "cpu"
     conventions: str = CONVENTIONS
     layout: int = LAYOUT
 
@@ -91,9 +93,10 @@ _METADATA_CHECKS: dict[str, Check] = {
     "version": string,
     "gaussians": flag,
     "precision": string,
+    "target": string,
     "conventions": string,
 }
-_ADDED_LATER = frozenset({"gaussians", "precision", "conventions"})
+_ADDED_LATER = frozenset({"gaussians", "precision", "target", "conventions"})
 _STAGE: dict[str, Check] = {"name": string, "file": string, "inputs": names, "outputs": names}
 
 

@@ -9,6 +9,7 @@ import onnx
 import pytest
 from idesplat.export import tracing
 from idesplat.export.stages import NamedTensors
+from idesplat.export.targets import OPSET
 from idesplat.export.tracing import WEIGHTS, StaticShape
 from idesplat.runtime.inference.metadata import ModelMetadata
 from shared_fixtures import build_once
@@ -20,14 +21,16 @@ def keeping_trace(factory: pytest.TempPathFactory) -> Callable[..., onnx.ModelPr
     """`idesplat.export.tracing.trace`, which copies what it made before of the same network, weights and sizes."""
     trace = tracing.trace
 
-    def kept(network: NamedTensors, metadata: ModelMetadata, static: StaticShape, folder: Path) -> onnx.ModelProto:
-        sizes = (static, metadata.near, metadata.far, metadata.size_multiple)
+    def kept(
+        network: NamedTensors, metadata: ModelMetadata, static: StaticShape, folder: Path, opset: int = OPSET
+    ) -> onnx.ModelProto:
+        sizes = (opset, static, metadata.near, metadata.far, metadata.size_multiple)
         key = hashlib.sha256(repr((network.model.config, sizes)).encode())
         for name, value in network.state_dict().items():
             key.update(name.encode() + value.numpy().tobytes())
 
         def build(target: Path) -> None:
-            model = trace(network, metadata, static, target)
+            model = trace(network, metadata, static, target, opset)
             (target / GRAPH).write_bytes(model.SerializeToString())
 
         made = build_once(factory, f"trace-{key.hexdigest()[:16]}", build)

@@ -68,4 +68,5 @@ def test_the_networks_own_are_put_back() -> None:
 def test_few_numbers_are_gathered_at_once() -> None:
     attention = GatherAttention(FEW - 1, BLOCK)
     with chunked(attention):
-        assert attention.gathered_dot is gathered.gathered_dot
+        assert attention.gathered_dot.func is gathered.gathered_dot
+        assert attention.gathered_dot.keywords == {"chunk": FEW}
