@@ -60,6 +60,8 @@ export interface Reconstruction {
   far: number;
   provider: Provider;
   threads: number;
+  /** Bytes of WebAssembly's memory at the end, which is its peak. */
+  memory: number;
   /** Lines for the user: what was left out, cropped or compensated. */
   notes: string[];
   /** Time by stage: prepare, load, predict. */

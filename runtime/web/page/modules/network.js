@@ -9,6 +9,20 @@ const RUNTIMES = {
 const GZIP = [0x1f, 0x8b];
 const MAX_THREADS = 8; // more gain nothing on graphs of this size
 
+// Memories of WebAssembly that were made in this worker, to tell how large they grew.
+const memories = [];
+WebAssembly.Memory = class extends WebAssembly.Memory {
+  constructor(descriptor) {
+    super(descriptor);
+    memories.push(this);
+  }
+};
+
+/** Bytes of WebAssembly's memories, which never shrink. */
+export function wasmBytes() {
+  return memories.reduce((sum, memory) => sum + memory.buffer.byteLength, 0);
+}
+
 /** @typedef {"wasm" | "webgpu"} Provider */
 /** @typedef {{ name: string, file: string, views: number, height: number, width: number, near: number, far: number }} Model */
 

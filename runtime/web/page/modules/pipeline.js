@@ -7,7 +7,7 @@ import { compensateExposure } from "./exposure.js";
 import { decode, readHeader } from "./image_files.js";
 import { norm, positionOf, subtract } from "./linear.js";
 import { alongEpipolarLines, relativePose } from "./matching.js";
-import { Network, readModel } from "./network.js";
+import { Network, readModel, wasmBytes } from "./network.js";
 import { selectPair } from "./selection.js";
 import { makeView, matchViews } from "./views.js";
 
@@ -37,7 +37,7 @@ export async function run(files, cameras, options, onProgress, base) {
   const { provider, threads } = network;
   const result = await predict(network, views, placed, model);
   clock.lap("predict");
-  const memory = provider === "wasm" ? (network.ort.env.wasm.memoryBytes ?? null) : null;
+  const memory = wasmBytes();
   await network.close();
   const poses = views.map(({ name, camera, intrinsics }) => ({ name, pose: camera.pose, intrinsics }));
   return { ...result, cameras: poses, near: placed.near, far: placed.far, provider, threads, memory, notes, seconds: clock.seconds };
