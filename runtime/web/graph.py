@@ -1,5 +1,6 @@
 """The graph that the page loads: of fixed sizes, folded, since a browser opens fewer nodes sooner."""
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -7,21 +8,30 @@ import onnxruntime
 
 from ..errors import InputError
 from ..images.sizes import describe_size_rule, is_valid_size
+from ..inference.metadata import METADATA_KEY
 from ..inference.model_files import ModelFiles
+from ..inference.onnx_metadata import read_properties
 from ..inference.session import FATAL_ONLY
 from ..system.files import scratch_folder
 
 VIEWS = 2
+WEB_TARGET = "web"  # the `target` in the metadata of a graph that runs on WebGPU
 DIMENSIONS = ("views", "height", "width")  # names of the dynamic dimensions in our graphs
 
 
 @dataclass(frozen=True)
 class PageGraph:
-    """A graph for `VIEWS` images of height x width. content: the .onnx file."""
+    """A graph for `VIEWS` images of height x width.
+
+    content: the .onnx file. webgpu: whether it was exported for WebGPU (its metadata say `"target": "web"`). Other
+    graphs hold loops, and convolutions that ONNX Runtime 1.30 computes wrongly on WebGPU, without an error: those of a
+    multiple of 3 input channels that is no multiple of 4.
+    """
 
     content: bytes
     height: int
     width: int
+    webgpu: bool
 
 
 def page_graph(model: ModelFiles, size: tuple[int, int] | None = None) -> PageGraph:
@@ -39,8 +49,14 @@ def page_graph(model: ModelFiles, size: tuple[int, int] | None = None) -> PageGr
         raise InputError(f"--size {height}x{width}: {describe_size_rule(own.size_multiple)}")
     model.check_size(VIEWS, height, width)
     if own.fixed_size and own.fixed_views:
-        return PageGraph(path.read_bytes(), height, width)
-    return PageGraph(_fixed(path, (VIEWS, height, width)), height, width)
+        return PageGraph(path.read_bytes(), height, width, _target(path) == WEB_TARGET)
+    return PageGraph(_fixed(path, (VIEWS, height, width)), height, width, _target(path) == WEB_TARGET)
+
+
+def _target(path: Path) -> str | None:
+    """What the graph was exported for, if it says so."""
+    found: str | None = json.loads(read_properties(path)[METADATA_KEY]).get("target")
+    return found
 
 
 def _fixed(path: Path, sizes: tuple[int, int, int]) -> bytes:

@@ -17,7 +17,8 @@ from .third_party import pinned_packages, third_party_files
 PAGE = Path(__file__).with_name("page")
 MODEL, GRAPH, WORKER, LICENCES = "model.json", "model.onnx.gz", "service-worker.js", "lib/third-party.json"
 PACKED_SUFFIX = ".gz"  # of files that the page unpacks, so that a host need not compress them
-VERSION_MARK = "DEVELOPMENT"  # in the service worker: replaced by a digest of all files
+# In the service worker: replaced by a digest of all files, and by the files that it keeps from the start.
+VERSION_MARK, FILES_MARK = "DEVELOPMENT", 'FILES = ["./"]'
 VERSION_LENGTH = 16
 TEXT_SUFFIXES = (".html", ".css", ".js", ".mjs", ".json", ".ts")
 
@@ -49,11 +50,12 @@ def write_site(folder: Path, model: ModelFiles, size: tuple[int, int] | None = N
         "views": VIEWS,
         "height": graph.height,
         "width": graph.width,
+        "webgpu": graph.webgpu,
         "near": own.near,
         "far": own.far,
     }
     content[MODEL] = (json.dumps(description, indent=1) + "\n").encode()
-    content[WORKER] = content[WORKER].replace(VERSION_MARK.encode(), _version(content).encode())
+    content[WORKER] = _service_worker(content)
     return Site(_write(folder, content), sum(len(_as_sent(name, part)) for name, part in content.items()))
 
 
@@ -72,6 +74,13 @@ def _third_party() -> dict[str, bytes]:
     ]
     found[LICENCES] = (json.dumps(licences, indent=1) + "\n").encode()
     return found
+
+
+def _service_worker(content: Mapping[str, bytes]) -> bytes:
+    """The service worker for this content, which keeps all but packed files from the start."""
+    names = ["./", *sorted(name for name in content if not name.endswith((PACKED_SUFFIX, WORKER, ".d.ts")))]
+    text = content[WORKER].decode().replace(VERSION_MARK, _version(content))
+    return text.replace(FILES_MARK, f"FILES = {json.dumps(names)}").encode()
 
 
 def _version(content: Mapping[str, bytes]) -> str:

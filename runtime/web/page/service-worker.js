@@ -3,14 +3,25 @@
  * (cross-origin isolation), which static hosts do not send.
  */
 
+// Both are filled in by `idesplat web`. FILES: what the page needs to open; the model and the engine are kept when used.
 const CACHE = "idesplat-DEVELOPMENT";
+const FILES = ["./"];
 const HEADERS = {
   "Cross-Origin-Opener-Policy": "same-origin",
   "Cross-Origin-Embedder-Policy": "require-corp",
   "Cross-Origin-Resource-Policy": "same-origin",
 };
 
-self.addEventListener("install", () => self.skipWaiting());
+self.addEventListener("install", (event) => {
+  self.skipWaiting();
+  event.waitUntil(keepFiles());
+});
+
+async function keepFiles() {
+  const cache = await caches.open(CACHE);
+  const keep = async (name) => cache.put(name, isolated(await fetch(name, { cache: "no-cache" })));
+  await Promise.all(FILES.map(keep));
+}
 
 self.addEventListener("activate", (event) => {
   const tidy = async () => {

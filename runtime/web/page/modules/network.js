@@ -24,7 +24,8 @@ export function wasmBytes() {
 }
 
 /** @typedef {"wasm" | "webgpu"} Provider */
-/** @typedef {{ name: string, file: string, views: number, height: number, width: number, near: number, far: number }} Model */
+/** @typedef {{ name: string, file: string, views: number, height: number, width: number,
+ *   near: number, far: number, webgpu: boolean }} Model */
 
 /** Fetch a file of the page, unpacked if it is packed. @param {URL} url @param {(share: number) => void} onShare */
 export async function fetchFile(url, onShare = () => {}) {
@@ -74,7 +75,7 @@ export class Network {
     const graph = new Uint8Array(await fetchFile(new URL(model.file, base), onShare));
     const candidates = asked ? [asked] : ["webgpu", "wasm"];
     for (const provider of candidates) {
-      const problem = provider === "webgpu" ? await webgpuProblem() : null;
+      const problem = provider === "webgpu" ? await webgpuProblem(model) : null;
       if (problem) {
         if (asked) throw new InputError(`${problem}; choose WebAssembly`);
         continue;
@@ -121,8 +122,10 @@ async function openWith(provider, base, model, graph) {
   return new Network(ort, session, provider, threads, model);
 }
 
-/** Why WebGPU cannot be used; null if it can. */
-async function webgpuProblem() {
+/** Why WebGPU cannot be used; null if it can. @param {Model} model */
+async function webgpuProblem(model) {
+  // ONNX Runtime 1.30 computes some convolutions of other graphs wrongly on WebGPU, without an error.
+  if (!model.webgpu) return "the graph of this page was not exported for WebGPU";
   const { gpu } = /** @type {any} */ (navigator);
   if (!gpu) return "this browser has no WebGPU";
   const adapter = await gpu.requestAdapter().catch(() => null);

@@ -9,6 +9,7 @@ const STEP = 0.05; // radians, and share of the distance, of a key
 const SWING = 0.2; // radians to each side
 const SWING_S = 6;
 const MAX_PIXEL_RATIO = 2;
+const DRAWN_S = 3; // after a change: the splats are sorted in the background
 
 /** Shows one scene. `dispose` frees the graphics memory. */
 export class Viewer {
@@ -24,6 +25,8 @@ export class Viewer {
     this.scene.add(this.pivot);
     this.controls = new OrbitControls(this.camera, canvas);
     this.swinging = false;
+    this.changed = performance.now();
+    this.controls.addEventListener("change", () => this.touch());
     this.onKey = (event) => this.key(event);
     canvas.addEventListener("keydown", this.onKey);
     this.resized = new ResizeObserver(() => this.resize());
@@ -48,8 +51,14 @@ export class Viewer {
     this.renderer.setAnimationLoop((time) => this.draw(time / 1000));
   }
 
+  /** Draw for a while: a scene that nobody turns costs no power. */
+  touch() {
+    this.changed = performance.now();
+  }
+
   /** Back to the first view. */
   reset() {
+    this.touch();
     this.pivot.rotation.set(0, 0, 0);
     this.camera.position.set(0, 0, 0);
     this.camera.near = this.distance / 100;
@@ -66,10 +75,12 @@ export class Viewer {
       this.swung = angle;
     }
     this.controls.update();
+    if (!this.swinging && performance.now() - this.changed > 1000 * DRAWN_S) return;
     this.renderer.render(this.scene, this.camera);
   }
 
   key(event) {
+    this.touch();
     const turns = { ArrowLeft: ["y", -STEP], ArrowRight: ["y", STEP], ArrowUp: ["x", -STEP], ArrowDown: ["x", STEP] };
     if (event.key in turns) {
       const [axis, angle] = turns[event.key];
@@ -86,6 +97,7 @@ export class Viewer {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     if (width === 0 || height === 0 || !this.focal) return;
     this.renderer.setSize(width, height, false);
+    this.touch();
     this.camera.aspect = width / height;
     const across = 0.5 / this.focal[0] / this.camera.aspect;
     this.camera.fov = (2 * Math.atan(Math.max(0.5 / this.focal[1], across)) * 180) / Math.PI;
