@@ -15,7 +15,8 @@ $(VENV)/.ready: pyproject.toml constraints.txt tests/npm/package-lock.json
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[dev]"
 	if command -v npm > /dev/null; then \
 		npm ci --prefix tests/npm --silent --no-audit --no-fund && \
-		npm install --prefix docs/examples --silent --no-audit --no-fund --no-package-lock; fi
+		npm install --prefix docs/examples --silent --no-audit --no-fund --no-package-lock && \
+		$(BIN)/python -P -m idesplat.runtime.web.third_party; fi
 	mkdir -p .typing/idesplat
 	for part in *.py py.typed model export runtime tools; do ln -sfn ../../$$part .typing/idesplat/$$part; done
 	touch $@
@@ -43,7 +44,7 @@ demo: setup
 
 # The npm files of the page of `idesplat web`, pinned in runtime/web/third_party.json; a wheel built afterwards holds them.
 web: setup
-	$(BIN)/python -m idesplat.runtime.web.third_party
+	$(BIN)/python -P -m idesplat.runtime.web.third_party
 
 # Photographs under free licences (MODEL_CARD.md) for the textures of training scenes; it needs Debian's apt and git.
 TEXTURES := gnome-backgrounds mate-backgrounds plasma-workspace-wallpapers

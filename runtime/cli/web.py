@@ -1,11 +1,11 @@
 """The command `idesplat web`: a page that reconstructs in the browser, as a folder for any static host."""
 
-import contextlib
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from ..errors import Terminated
 from .options import Config, Model, Overwrite, Quiet, Size, Verbose
 from .outputs import command
 from .terminal import run, say
@@ -50,8 +50,12 @@ def _serve(folder: Path, port: int) -> None:
 
     with page_server(folder, LOOPBACK, free_port(LOOPBACK, port)) as server:
         say(f"the page: {address(LOOPBACK, server.server_address[1])} (stop with Ctrl-C)")
-        with contextlib.suppress(KeyboardInterrupt):
+        try:
             server.serve_forever()
+        except Terminated:
+            raise
+        except KeyboardInterrupt:  # ends this command, as it should
+            return
 
 
 def main() -> None:

@@ -75,8 +75,7 @@ def third_party_files(vendor: Path = VENDOR) -> dict[str, bytes]:
     """
     content: dict[str, bytes] = {}
     for package in pinned_packages():
-        folders = vendor, _cache(package)
-        content |= next((found for folder in folders if (found := _read(package, folder))), None) or _download(package)
+        content |= _read(package, vendor) or _read(package, _cache(package)) or _download(package)
     return content
 
 

@@ -28,8 +28,13 @@ async function prepare() {
   }
 }
 
-function describeEnvironment() {
-  const gpu = "gpu" in navigator ? "WebGPU may be used" : "this browser has no WebGPU";
+async function describeEnvironment() {
+  const model = await (await fetch("model.json")).json();
+  const usable = model.webgpu && "gpu" in navigator;
+  if (!usable) element("provider").value = "wasm";
+  for (const option of element("provider").options) option.disabled = !usable && option.value !== "wasm";
+  const without = model.webgpu ? "This browser has no WebGPU" : "The graph of this page was not made for WebGPU";
+  const gpu = usable ? "WebGPU may be used" : without;
   const count = navigator.hardwareConcurrency ?? 1;
   const threads = globalThis.crossOriginIsolated ? `WebAssembly has ${count} threads` : "WebAssembly has one thread";
   element("environment").textContent = `${gpu}. ${threads}.`;
@@ -208,5 +213,5 @@ document.addEventListener("drop", async (event) => {
   if (event.dataTransfer) addFiles(await filesOfDrop(event.dataTransfer));
 });
 
-describeEnvironment();
+describeEnvironment().catch((error) => showError(`model.json cannot be loaded (${error}); copy the whole folder to the host`));
 prepare();
