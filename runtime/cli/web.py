@@ -31,11 +31,11 @@ def web(
     The page works offline once it was open, and uploads nothing. It takes two views of one size, 256x256 by default.
     """
     from ..images.sizes import parse_size
-    from ..inference.bundled_model import bundled_model
     from ..inference.model_files import read_model
+    from ..inference.named_models import find_model
     from ..web.site import write_site
 
-    files = read_model(model or bundled_model())
+    files = read_model(find_model(model))
     site = write_site(folder, files, parse_size(size) if size else None)
     say(f"wrote {len(site.files)} files to {folder}, {site.download / 1e6:.1f} MB to download")
     if serve:
