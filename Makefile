@@ -4,7 +4,7 @@ BIN := $(VENV)/bin
 # Two processes of one thread each are faster than one of two threads: most tests are too small to share out.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --quiet -n 2 --dist loadfile --no-loadscope-reorder
 
-.PHONY: setup test quick check docs demo weights clean
+.PHONY: setup test quick check docs demo web weights clean
 
 setup: $(VENV)/.ready
 
@@ -15,7 +15,8 @@ $(VENV)/.ready: pyproject.toml constraints.txt tests/npm/package-lock.json
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[dev]"
 	if command -v npm > /dev/null; then \
 		npm ci --prefix tests/npm --silent --no-audit --no-fund && \
-		npm install --prefix docs/examples --silent --no-audit --no-fund --no-package-lock; fi
+		npm install --prefix docs/examples --silent --no-audit --no-fund --no-package-lock && \
+		$(BIN)/python -P -m idesplat.runtime.web.third_party; fi
 	mkdir -p .typing/idesplat
 	for part in *.py py.typed model export runtime tools; do ln -sfn ../../$$part .typing/idesplat/$$part; done
 	touch $@
@@ -41,6 +42,10 @@ docs: setup
 demo: setup
 	$(BIN)/python -P -m idesplat.tools.figures.demo demo
 
+# The npm files of the page of `idesplat web`, pinned in runtime/web/third_party.json; a wheel built afterwards holds them.
+web: setup
+	$(BIN)/python -P -m idesplat.runtime.web.third_party
+
 # Photographs under free licences (MODEL_CARD.md) for the textures of training scenes; it needs Debian's apt and git.
 TEXTURES := gnome-backgrounds mate-backgrounds plasma-workspace-wallpapers
 runs/textures:
@@ -62,4 +67,4 @@ weights: setup runs/textures
 	$(BIN)/python -P -m idesplat.tools.training.release runs/head/last.ckpt --preset idesplat-lite
 
 clean:
-	rm -rf $(VENV) build site .typing tests/npm/node_modules docs/examples/node_modules *.egg-info
+	rm -rf $(VENV) build site .typing tests/npm/node_modules docs/examples/node_modules runtime/web/vendor *.egg-info

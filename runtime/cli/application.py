@@ -27,6 +27,7 @@ COMMANDS = {
     "models": SubCommand(".models", "models", "List the models that --model takes by name."),
     "pull": SubCommand("...export.released.cli", "pull", "Download a released model, and export it into the cache."),
     "view": SubCommand(".view", "view", "Look at a splat file in the browser."),
+    "web": SubCommand(".web", "web", "Write a page that makes splats in the browser, for any static host."),
     "render": SubCommand(".render", "render", "A splat file to images or a video."),
     "refine": SubCommand(".refine", "refine", "Fit a splat file to the images of its scene."),
     "convert": SubCommand(".convert", "convert", "A splat file to another format."),

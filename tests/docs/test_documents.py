@@ -31,7 +31,7 @@ TO_BE_WRITTEN_MODULES = {"idesplat.model.mono"}
 OLD_COMMANDS = ("idesplat-infer", "idesplat-export")  # other names of sub-commands
 CODE = re.compile(r"```[^\n]*\n(.*?)```|`([^`\n]+)`", re.DOTALL)
 INDENTED = re.compile(r"^    (\S(?:.*\\\n)*.*)", re.MULTILINE)
-MODULE = re.compile(r"\bidesplat(?:\.[A-Za-z_]\w*)+")
+MODULE = re.compile(r"\bidesplat(?!\.js\b)(?:\.[A-Za-z_]\w*)+")  # idesplat.js is a file of the page
 PLACES = r"(?:runtime|model|export|tools|tests|docs)"
 REPOSITORY_PATH = re.compile(rf"^{PLACES}/[\w./-]+$")
 

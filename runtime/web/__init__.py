@@ -1,0 +1,1 @@
+"""The page that reconstructs in the browser, and the folder of files that it consists of."""

@@ -1,0 +1,28 @@
+/**
+ * Images to 3D Gaussians in the browser. `idesplat.d.ts` describes what is exported.
+ *
+ *   import { reconstruct } from "./idesplat.js";
+ *   const { ply, depth, gaussians } = await reconstruct(files, cameras, { provider: "wasm", onProgress });
+ */
+
+import { InputError } from "./modules/errors.js";
+import { toPly, toSpz } from "./modules/splat_files.js";
+
+export { InputError, toPly, toSpz };
+
+/** @type {import("./idesplat.d.ts").reconstruct} */
+export function reconstruct(files, cameras, options = {}) {
+  const { provider = null, near, far, onProgress = () => {}, signal } = options;
+  const worker = new Worker(new URL("./worker.js", import.meta.url), { type: "module" });
+  const done = new Promise((resolve, reject) => {
+    worker.onerror = (event) => reject(new InputError(`the worker failed (${event.message}); reload the page`));
+    worker.onmessage = ({ data }) => {
+      if (data.kind === "progress") onProgress({ stage: data.stage, share: data.share });
+      else if (data.kind === "error") reject(new InputError(data.message));
+      else resolve({ ...data.result, ply: toPly(data.result.gaussians) });
+    };
+    signal?.addEventListener("abort", () => reject(new InputError("stopped")));
+  });
+  worker.postMessage({ files: [...files], cameras, options: { provider, near, far } });
+  return /** @type {any} */ (done.finally(() => worker.terminate()));
+}

@@ -1,0 +1,171 @@
+/** The whole flow: image files and cameras to depth and Gaussians. */
+
+import { parseTransforms, stem } from "./cameras.js";
+import { depthRange } from "./depth_range.js";
+import { InputError } from "./errors.js";
+import { compensateExposure } from "./exposure.js";
+import { decode, readHeader } from "./image_files.js";
+import { norm, positionOf, subtract } from "./linear.js";
+import { alongEpipolarLines, relativePose } from "./matching.js";
+import { Network, readModel, wasmBytes } from "./network.js";
+import { selectPair } from "./selection.js";
+import { makeView, matchViews } from "./views.js";
+
+const SAME_POSITION = 1e-9; // relative to the distance from the origin
+
+/** @typedef {(stage: string, share: number | null) => void} OnProgress share: null where it is not known */
+
+/**
+ * @param {File[]} files @param {any} cameras a parsed transforms.json, a list of cameras, or null
+ * @param {{ provider?: import("./network.js").Provider | null, near?: number, far?: number }} options
+ * @param {OnProgress} onProgress @param {URL} base folder of the page's files
+ */
+export async function run(files, cameras, options, onProgress, base) {
+  const clock = stopwatch();
+  const notes = [];
+  onProgress("reading images", null);
+  const model = await readModel(base);
+  const pairs = await pairUp(files, cameras, notes);
+  const views = await chosenViews(pairs, model, onProgress, notes);
+  onProgress("finding near and far", null);
+  const placed = compareViews(views, model, options, notes);
+  clock.lap("prepare");
+  const show = (share) => onProgress("loading the model", share);
+  const network = await Network.open(base, model, options.provider ?? null, show, (line) => notes.push(line));
+  clock.lap("load");
+  onProgress("predicting depth and Gaussians", null);
+  const { provider, threads } = network;
+  const result = await predict(network, views, placed, model);
+  clock.lap("predict");
+  const memory = wasmBytes();
+  await network.close();
+  const poses = views.map(({ name, camera, intrinsics }) => ({ name, pose: camera.pose, intrinsics }));
+  return { ...result, cameras: poses, near: placed.near, far: placed.far, provider, threads, memory, notes, seconds: clock.seconds };
+}
+
+function stopwatch() {
+  const seconds = {};
+  let last = performance.now();
+  const lap = (name) => {
+    seconds[name] = (performance.now() - last) / 1000;
+    last = performance.now();
+  };
+  return { seconds, lap };
+}
+
+/** The images that have a camera, with it. */
+async function pairUp(files, cameras, notes) {
+  if (files.length < 2) {
+    const found = files.length === 1 ? "one image" : "no images";
+    throw new InputError(`${found} given, expected at least two of the same scene; add images`);
+  }
+  if (cameras === null || cameras === undefined) {
+    throw new InputError("no cameras given; add the transforms.json of the images");
+  }
+  const sizes = [];
+  for (const file of files) {
+    const { width, height, orientation } = await readHeader(file);
+    sizes.push(orientation > 4 ? { name: file.name, width: height, height: width } : { name: file.name, width, height });
+  }
+  const known = Array.isArray(cameras) ? cameras : parseTransforms(cameras, sizes);
+  const pairs = [];
+  for (const file of files) {
+    const named = known.filter((camera) => stem(camera.name) === stem(file.name));
+    const exact = named.filter((camera) => camera.name.split("/").pop() === file.name);
+    const [camera] = exact.length > 0 ? exact : named;
+    if (camera) pairs.push({ file, camera });
+    else notes.push(`${file.name}: no camera names it; left out`);
+  }
+  if (pairs.length < 2) {
+    const names = known.slice(0, 3).map((camera) => camera.name).join(", ");
+    throw new InputError(
+      `${pairs.length} of ${files.length} images are named by the cameras (${names}, ...), expected at least two; ` +
+        "add the images that the cameras were made for",
+    );
+  }
+  return pairs;
+}
+
+/** The two views to use, at the network's size. */
+async function chosenViews(pairs, model, onProgress, notes) {
+  const { height, width } = model;
+  const loaded = new Map();
+  const view = async (index) => {
+    if (!loaded.has(index)) {
+      onProgress(`reading ${pairs[index].file.name}`, null);
+      const image = await decode(pairs[index].file);
+      loaded.set(index, makeView(image, pairs[index].camera, height, width));
+    }
+    return loaded.get(index);
+  };
+  const cameras = pairs.map(({ camera }) => camera);
+  const [first, second] = await selectPair(cameras, async (index) => (await view(index)).features);
+  if (pairs.length > 2) {
+    notes.push(`2 of ${pairs.length} images used: ${pairs[first].file.name}, ${pairs[second].file.name}`);
+  }
+  const views = [await view(first), await view(second)];
+  const share = Math.min(...views.map((each) => each.share));
+  if (share < 1) {
+    notes.push(`of each image the middle ${height} x ${width} is used, ${Math.round(100 * share)} % of it`);
+  }
+  return views;
+}
+
+/** Near, far and a common exposure, from matched points. */
+function compareViews(views, model, options, notes) {
+  const poses = views.map(({ camera }) => camera.pose);
+  const [a, b] = poses.map(positionOf);
+  if (norm(subtract(a, b)) <= SAME_POSITION * Math.max(norm(a), norm(b))) {
+    throw new InputError(`${views[0].name} and ${views[1].name} are at the same position; depth needs a baseline`);
+  }
+  const pose = relativePose(poses[0], poses[1]);
+  const { pairs, first, second } = matchViews(views[0], views[1]);
+  const [firstK, secondK] = views.map(({ features }) => features.camera.K);
+  const matches = alongEpipolarLines(pairs, first, second, firstK, secondK, pose);
+  const found = depthRange(matches, pose, poses, model);
+  const [near, far] = [options.near ?? found.near, options.far ?? found.far];
+  if (!(near > 0 && near < far)) {
+    throw new InputError(`near ${near} and far ${far} (${found.source}), expected 0 < near < far; give both`);
+  }
+  notes.push(`near ${near.toPrecision(3)} and far ${far.toPrecision(3)}: ${found.source}`);
+  const exposure = compensateExposure(views, matches, model.height, model.width);
+  if (exposure.compensated) {
+    notes.push(`exposure differs by ${Math.round(100 * exposure.difference)} % between views; compensated`);
+  }
+  return { near, far, poses };
+}
+
+/** Depth and Gaussians in the unit and frame of the cameras; the network works in those of its training. */
+async function predict(network, views, { near, far, poses }, model) {
+  const { height, width } = model;
+  const scale = model.near / near;
+  const positions = poses.map(positionOf);
+  const origin = [0, 1, 2].map((axis) => (positions[0][axis] + positions[1][axis]) / 2);
+  const normalized = poses.map((pose) =>
+    pose.map((value, index) => (index % 4 === 3 && index < 12 ? (value - origin[index >> 2]) * scale : value)),
+  );
+  const images = new Float32Array(2 * views[0].image.length);
+  views.forEach((view, index) => images.set(view.image, index * view.image.length));
+  const matrices = views.flatMap(({ intrinsics: [fx, fy, cx, cy] }) => [fx, 0, cx, 0, fy, cy, 0, 0, 1]);
+  const outputs = await network.run({
+    images: { data: images, dims: [2, 3, height, width] },
+    extrinsics: { data: Float32Array.from(normalized.flat()), dims: [2, 4, 4] },
+    intrinsics: { data: Float32Array.from(matrices), dims: [2, 3, 3] },
+    near: { data: Float32Array.of(near * scale, near * scale), dims: [2] },
+    far: { data: Float32Array.of(far * scale, far * scale), dims: [2] },
+  });
+  if (!outputs.means.every(Number.isFinite)) {
+    throw new InputError("the network gave values that are not finite; choose WebAssembly, or other images");
+  }
+  const gaussians = {
+    count: outputs.opacities.length,
+    means: outputs.means.map((value, index) => value / scale + origin[index % 3]),
+    scales: outputs.scales.map((value) => value / scale),
+    quats: outputs.quats,
+    opacities: outputs.opacities,
+    sh: outputs.sh,
+  };
+  const depth = { data: outputs.depth.map((value) => value / scale), views: 2, height, width };
+  return { depth, gaussians };
+}
+
