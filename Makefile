@@ -4,7 +4,7 @@ BIN := $(VENV)/bin
 # Two processes of one thread each are faster than one of two threads: most tests are too small to share out.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --quiet -n 2 --dist loadfile --no-loadscope-reorder
 
-.PHONY: setup test quick check docs demo web weights clean
+.PHONY: setup test webgpu quick check docs demo web weights clean
 
 setup: $(VENV)/.ready
 
@@ -21,13 +21,17 @@ $(VENV)/.ready: pyproject.toml constraints.txt tests/npm/package-lock.json
 	for part in *.py py.typed model export runtime tools; do ln -sfn ../../$$part .typing/idesplat/$$part; done
 	touch $@
 
-# Lint, types and every test.
+# Lint, types and every test but that of `make webgpu`.
 test: check
-	$(PYTEST)
+	$(PYTEST) -m "not webgpu"
+
+# A whole network on a WebGPU adapter in software: four minutes.
+webgpu: setup
+	$(PYTEST) -m webgpu
 
 # For the edit loop: the tests that take less than a second each.
 quick: setup
-	$(PYTEST) -m "not slow and not browser and not network"
+	$(PYTEST) -m "not slow and not browser and not network and not webgpu"
 
 check: setup
 	$(BIN)/ruff check .

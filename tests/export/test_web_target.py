@@ -2,10 +2,11 @@
 
 import re
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -20,7 +21,7 @@ RUNTIME = Path(__file__).parents[2] / "docs" / "examples" / "node_modules" / "on
 SIDE = 64
 GPU_FLAGS = "--enable-unsafe-webgpu --use-webgpu-adapter=swiftshader --enable-features=Vulkan"
 PLACED = re.compile(r"Node\(s\) placed on \[(\w+)\]\. Number of nodes: (\d+)")
-# Opens the graph on WebGPU, with ONNX Runtime's log in the console, and runs it once.
+# Opens the graph on WebGPU, with ONNX Runtime's log in the console; runs it once where it has inputs.
 SCRIPT = """async (shapes) => {
     const ort = await import("/runtime/ort.webgpu.bundle.min.mjs");
     ort.env.wasm.numThreads = 1;
@@ -29,6 +30,7 @@ SCRIPT = """async (shapes) => {
     const options = {executionProviders: ["webgpu"], logSeverityLevel: 0};
     const session = await ort.InferenceSession.create("/model.onnx", options);
     ort.env.logLevel = "warning";
+    if (!shapes) return null;
     const feeds = {};
     for (const name of session.inputNames) {
         const values = await (await fetch(`/${name}.f32`)).arrayBuffer();
@@ -105,22 +107,30 @@ class _QuietHandler(SimpleHTTPRequestHandler):
         pass
 
 
-@pytest.mark.browser
-@pytest.mark.slow
-def test_every_node_is_on_the_device(chromium, graph: Path, address: str, inputs) -> None:
-    """No node on the CPU, no copy between memories, and the depth of the native runtime."""
-    console: list[str] = []
+@pytest.fixture
+def run_in_browser(chromium, address: str) -> Iterator[Callable[[dict[str, list[int]] | None], tuple[Any, list[str]]]]:
+    """Runs the script in a page; its result and the lines of the console."""
     browser = chromium(GPU_FLAGS)
-    try:
+    console: list[str] = []
+
+    def run(shapes: dict[str, list[int]] | None) -> tuple[Any, list[str]]:
         page = browser.new_page()
         page.set_default_timeout(0)
         page.on("console", lambda message: console.append(message.text))
         page.goto(address)
         if not page.evaluate("async () => 'gpu' in navigator && (await navigator.gpu.requestAdapter()) !== null"):
             pytest.skip("this Chromium has no WebGPU adapter")
-        depth = page.evaluate(SCRIPT, {name: list(values.shape) for name, values in inputs.items()})
-    finally:
-        browser.close()
+        return page.evaluate(SCRIPT, shapes), console
+
+    yield run
+    browser.close()
+
+
+@pytest.mark.browser
+@pytest.mark.slow
+def test_every_node_is_on_the_device(run_in_browser) -> None:
+    """No node on the CPU, and no copy between memories."""
+    _, console = run_in_browser(None)
     placed = {provider: int(count) for line in console for provider, count in PLACED.findall(line)}
     assert set(placed) <= {"WebGpuExecutionProvider"} or placed.get("CPUExecutionProvider") == 0, placed
     if placed:
@@ -128,6 +138,12 @@ def test_every_node_is_on_the_device(chromium, graph: Path, address: str, inputs
     else:
         assert any("All nodes placed on [WebGpuExecutionProvider]" in line for line in console)
     assert not [line for line in console if "MemcpyToHost" in line or "MemcpyFromHost" in line]
+
+
+@pytest.mark.browser
+@pytest.mark.webgpu
+def test_it_computes_the_same_on_webgpu(run_in_browser, graph: Path, inputs) -> None:
+    depth, _ = run_in_browser({name: list(values.shape) for name, values in inputs.items()})
     expected = run_session(open_session(graph), inputs)["depth"]
     error = np.abs(np.array(depth, np.float32) - expected.ravel()) / expected.std()
     assert np.median(error) < 1e-4

@@ -82,4 +82,4 @@ def test_it_predicts_nearly_the_same_in_one_file_and_in_stages(lowered, exported
 def test_an_unknown_precision_is_refused_in_one_line(small_checkpoint, tmp_path, capsys):
     assert run_command(cli.main, small_checkpoint, tmp_path / "model.onnx", "--precision", "int4") == 2
     printed = capsys.readouterr().err
-    assert printed == "error: --precision int4: unknown; choose one of float32, int8, fp16\n"
+    assert printed == "error: --precision int4: unknown; choose one of float32, int8, int8-qdq, fp16\n"

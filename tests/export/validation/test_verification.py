@@ -355,7 +355,7 @@ def prepared(small_checkpoint, presets, kept_traces, tmp_path_factory):
 
 @pytest.fixture
 def without_tracing(prepared, monkeypatch):
-    def copy(network, description, fixed, folder):
+    def copy(network, description, fixed, folder, opset):
         shutil.copytree(prepared.folder, folder, dirs_exist_ok=True)
         return type(prepared)(folder, prepared.stages, prepared.nodes)
 
@@ -376,8 +376,8 @@ def test_the_files_that_are_written_are_those_that_were_verified(
     """A component goes wrong between the traced graphs and one of the files; the graphs themselves are sound."""
     save_model = conversion.save_model
 
-    def save_damaged(graph, out):
-        files = save_model(graph, out)
+    def save_damaged(graph, out, external):
+        files = save_model(graph, out, external)
         if out.name == damaged:
             one_channel(out)
         return files
@@ -396,8 +396,8 @@ def test_a_weight_of_little_effect_is_compared_too(
     """One weight is off by a rounding step, which no output shows."""
     save_model = conversion.save_model
 
-    def save_damaged(graph, out):
-        files = save_model(graph, out)
+    def save_damaged(graph, out, external):
+        files = save_model(graph, out, external)
         if out.name == damaged:
             model = onnx.load(out)
             tensor = max(model.graph.initializer, key=lambda tensor: len(tensor.raw_data))

@@ -5,23 +5,19 @@ import { InputError } from "./errors.js";
 const MAX_SIDE = 16384; // pixels: browsers draw nothing larger
 const MAX_PIXELS = 100e6;
 const HEADER_BYTES = 1 << 18;
-const FILM_WIDTH_MM = 36;
 const ORIENTATION = 0x0112;
-const EXIF_POINTER = 0x8769;
-const FOCAL_35MM = 0xa405;
 const SHORT = 3;
 
 /**
- * width, height: as stored, before the EXIF rotation; 0 if the format is not known here. focal35: focal length on
- * 35 mm film; null if not known.
- * @typedef {{ width: number, height: number, orientation: number, focal35: number | null }} Header
+ * width, height: as stored, before the EXIF rotation; 0 if the format is not known here.
+ * @typedef {{ width: number, height: number, orientation: number }} Header
  */
 
 /** Read and check the header of an image. @param {File} file @returns {Promise<Header>} */
 export async function readHeader(file) {
   if (file.size === 0) throw new InputError(`${file.name}: is empty, expected an image; copy it again`);
   const bytes = new DataView(await file.slice(0, HEADER_BYTES).arrayBuffer());
-  const header = pngHeader(bytes) ?? jpegHeader(bytes) ?? { width: 0, height: 0, orientation: 1, focal35: null };
+  const header = pngHeader(bytes) ?? jpegHeader(bytes) ?? { width: 0, height: 0, orientation: 1 };
   if (Math.max(header.width, header.height) > MAX_SIDE || header.width * header.height > MAX_PIXELS) {
     throw new InputError(
       `${file.name}: has ${header.width} x ${header.height} pixels, expected at most ${MAX_SIDE} a side and ` +
@@ -33,12 +29,12 @@ export async function readHeader(file) {
 
 function pngHeader(bytes) {
   if (bytes.byteLength < 24 || bytes.getUint32(0) !== 0x89504e47) return null;
-  return { width: bytes.getUint32(16), height: bytes.getUint32(20), orientation: 1, focal35: null };
+  return { width: bytes.getUint32(16), height: bytes.getUint32(20), orientation: 1 };
 }
 
 function jpegHeader(bytes) {
   if (bytes.byteLength < 4 || bytes.getUint16(0) !== 0xffd8) return null;
-  const found = { width: 0, height: 0, orientation: 1, focal35: null };
+  const found = { width: 0, height: 0, orientation: 1 };
   for (let at = 2; at + 10 <= bytes.byteLength; ) {
     const marker = bytes.getUint16(at);
     if (marker === 0xffe1 && bytes.getUint32(at + 4) === 0x45786966) Object.assign(found, exif(bytes, at + 10));
@@ -50,32 +46,23 @@ function jpegHeader(bytes) {
   return found;
 }
 
-/** Orientation and focal length of the EXIF block that starts at `start`. */
+/** Orientation of the EXIF block that starts at `start`. */
 function exif(bytes, start) {
   const found = {};
   try {
     const little = bytes.getUint16(start) === 0x4949;
-    const read = (offset) => {
-      const count = bytes.getUint16(start + offset, little);
-      for (let entry = start + offset + 2, k = 0; k < count; k++, entry += 12) {
-        const tag = bytes.getUint16(entry, little);
-        const isShort = bytes.getUint16(entry + 2, little) === SHORT;
-        const value = isShort ? bytes.getUint16(entry + 8, little) : bytes.getUint32(entry + 8, little);
-        if (tag === ORIENTATION) found.orientation = value;
-        if (tag === FOCAL_35MM && value > 0) found.focal35 = value;
-        if (tag === EXIF_POINTER) read(value);
+    const first = start + bytes.getUint32(start + 4, little);
+    const count = bytes.getUint16(first, little);
+    for (let entry = first + 2, k = 0; k < count; k++, entry += 12) {
+      const isOrientation = bytes.getUint16(entry, little) === ORIENTATION;
+      if (isOrientation && bytes.getUint16(entry + 2, little) === SHORT) {
+        found.orientation = bytes.getUint16(entry + 8, little);
       }
-    };
-    read(bytes.getUint32(start + 4, little));
+    }
   } catch (error) {
     if (!(error instanceof RangeError)) throw error; // a damaged block says nothing
   }
   return found;
-}
-
-/** Focal length in pixels of an upright image, from that on 35 mm film. */
-export function focalPixels(focal35, width, height) {
-  return (focal35 / FILM_WIDTH_MM) * Math.max(width, height);
 }
 
 /** Pixels of an image, upright, RGB, transparency over white. @param {File} file */
