@@ -36,7 +36,7 @@ def test_a_scene_is_done_once(worker, own, tmp_path):
     changed = Scene("a", own.images, options={"views": 3})
     again, tried = worker.run(changed, tmp_path / "out")
     assert tried
-    assert again["views"] == ["000.png", "001.png", "002.png"]
+    assert (len(record["views"]), len(again["views"])) == (2, 3)
 
 
 def test_a_failure_that_cannot_be_written_is_returned(worker, own, tmp_path):
