@@ -105,7 +105,6 @@ def batch(
     settings = Settings(
         *(files, model_sha256(files), provider, replace(session, threads=threads), dict(options or {}), retry_failed)
     )
-    make_folder(out)
     summary = Summary(len(chosen))
     failures = 0
     with closing(run_in_pool(chosen, out, min(workers, max(len(chosen), 1)), threads, settings)) as outcomes:
@@ -117,6 +116,7 @@ def batch(
             if max_failures is not None and failures >= max_failures:
                 break
     summary.left = summary.scenes - summary.done - summary.failed
+    make_folder(out)
     with atomic_write(summary_path(out, shard)) as temporary:
         temporary.write_text(json.dumps(asdict(summary), indent=2) + "\n", encoding="utf-8")
     return summary

@@ -12,7 +12,7 @@ from idesplat.runtime.errors import InputError
 from idesplat.runtime.inference.metadata import StageFile, write_manifest
 from idesplat.runtime.inference.model_files import read_model
 from idesplat.runtime.inference.session import DEFAULT
-from tiny_model import write_model
+from tiny_model import NETWORK, write_model
 
 
 @pytest.fixture
@@ -109,3 +109,12 @@ def test_nothing_of_others_is_replaced_and_nothing_stands_among_inputs(own, tmp_
         batch(scenes, tmp_path / "new", engine="ray")
     assert not (tmp_path / "new").exists()
     assert (out / "a" / "scene.ply").read_text() == "the user's own"
+
+
+@pytest.mark.slow
+def test_a_model_that_cannot_be_opened_ends_the_run_and_leaves_nothing(own, tmp_path):
+    shutil.copytree(own.images, tmp_path / "scenes" / "a")
+    model = write_model(tmp_path / "wrong.onnx", NETWORK.replace("Abs (means)", "Absent (means)"))
+    with pytest.raises(InputError, match="ONNX Runtime cannot load it"):
+        batch(tmp_path / "scenes", tmp_path / "out", model=model)
+    assert not (tmp_path / "out").exists()
