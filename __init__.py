@@ -12,6 +12,7 @@ from idesplat.runtime import startup as startup
 
 if TYPE_CHECKING:
     from .export.pipeline import export_checkpoint
+    from .runtime.batch.run import batch
     from .runtime.cameras.camera import Camera
     from .runtime.cameras.io import read_cameras, write_cameras
     from .runtime.errors import InputError
@@ -39,6 +40,7 @@ _MODULE_OF = {
     "Prediction": "runtime.inference.predictor",
     "Predictor": "runtime.inference.predictor",
     "Reconstruction": "runtime.reconstruction.result",
+    "batch": "runtime.batch.run",
     "bundled_model": "runtime.inference.bundled_model",
     "estimate_cameras": "runtime.sfm.estimate",
     "export_checkpoint": "export.pipeline",
@@ -65,6 +67,7 @@ __all__ = [
     "Reconstruction",
     "Runner",
     "__version__",
+    "batch",
     "bundled_model",
     "estimate_cameras",
     "evaluate",

@@ -15,24 +15,36 @@ from ..views.exposure_mode import ExposureMode
 from .interrupting import StopOnInterrupt
 from .options import (
     CamerasFormat,
+    CloseHoles,
     Config,
+    Crop,
+    CropBorder,
+    DepthJump,
     Device,
+    Exposure,
     Far,
     Focal,
     Images,
     Json,
     MaxGaussians,
+    MergeDuplicates,
+    MinConsistency,
+    MinOpacity,
     Model,
     Near,
+    Offset,
     Overwrite,
     Provider,
     ProviderOption,
     QualityOption,
     Quiet,
     Refine,
+    RemoveContradicted,
+    Select,
     Size,
     Threads,
     Verbose,
+    Views,
 )
 from .outputs import command
 from .reporting import note
@@ -49,7 +61,6 @@ OUT_HELP = (
     "Surfaces: .mesh.ply, .mesh.glb, .mesh.obj. Else a .ply in the current folder, named after the folder of the "
     "photographs."
 )
-FILTERS = "Filters (off unless asked for)"
 
 
 @command("idesplat infer")
@@ -81,35 +92,16 @@ def infer(
     camera_format: CamerasFormat = None,
     focal: Focal = None,
     quality: QualityOption = None,
-    views: Annotated[
-        str | None,
-        typer.Option(
-            help="How many images to use, those with the best baselines; else as --quality says, or all of --select.",
-            metavar="N|all",
-        ),
-    ] = None,
-    select: Annotated[
-        str | None, typer.Option(help="Images to use: names, numbers from 0, 0-3 or 0:8:2, with commas between.")
-    ] = None,
+    views: Views = None,
+    select: Select = None,
     size: Size = None,
-    crop: Annotated[
-        bool, typer.Option("--crop", help="Use the middle of the images at the model's trained size.")
-    ] = False,
+    crop: Crop = False,
     refine: Refine = None,
     max_gaussians: MaxGaussians = 0,
     near: Near = None,
     far: Far = None,
-    offset: Annotated[
-        str | None,
-        typer.Option(
-            help="Write coordinates relative to this, where they are large (surveys): `auto` finds it if it is needed.",
-            metavar="auto|X,Y,Z",
-        ),
-    ] = None,
-    exposure: Annotated[
-        ExposureMode,
-        typer.Option(help="Bring images of differing exposure and white balance to a common one, or leave them."),
-    ] = ExposureMode.AUTO,
+    offset: Offset = None,
+    exposure: Exposure = ExposureMode.AUTO,
     provider: Provider = "CPU",
     provider_option: ProviderOption = None,
     device: Device = None,
@@ -120,51 +112,13 @@ def infer(
         typer.Option(help="Of --save-depth: .png and metric .npz (default), or a dense workspace of COLMAP."),
     ] = None,
     render: Annotated[Path | None, typer.Option(help="Folder for views rendered from the result.")] = None,
-    min_opacity: Annotated[
-        float, typer.Option(help="Leave out Gaussians of lower opacity, 0 to 1.", rich_help_panel=FILTERS)
-    ] = 0,
-    crop_border: Annotated[
-        int, typer.Option(help="Leave out this many pixels along every image's edges.", rich_help_panel=FILTERS)
-    ] = 0,
-    max_depth_jump: Annotated[
-        float,
-        typer.Option(
-            help="Leave out pixels whose depth differs from a neighbour's by more than this share, such as 0.05.",
-            rich_help_panel=FILTERS,
-        ),
-    ] = 0,
-    min_consistency: Annotated[
-        float,
-        typer.Option(
-            help="Leave out pixels whose depth a smaller share of the other views confirms, such as 0.5.",
-            rich_help_panel=FILTERS,
-        ),
-    ] = 0,
-    remove_contradicted: Annotated[
-        bool,
-        typer.Option(
-            "--remove-contradicted",
-            help="Leave out what other views see through, with three views or more (--quality standard and high do).",
-            rich_help_panel=FILTERS,
-        ),
-    ] = False,
-    merge_duplicates: Annotated[
-        bool,
-        typer.Option(
-            "--merge-duplicates",
-            help="Make one Gaussian of those that views put at the same place.",
-            rich_help_panel=FILTERS,
-        ),
-    ] = False,
-    close_holes: Annotated[
-        bool,
-        typer.Option(
-            "--close-holes",
-            help="Fit the Gaussians' shapes to the surface, and let the background go on behind edges (--quality "
-            "standard and high do).",
-            rich_help_panel=FILTERS,
-        ),
-    ] = False,
+    min_opacity: MinOpacity = 0,
+    crop_border: CropBorder = 0,
+    max_depth_jump: DepthJump = 0,
+    min_consistency: MinConsistency = 0,
+    remove_contradicted: RemoveContradicted = False,
+    merge_duplicates: MergeDuplicates = False,
+    close_holes: CloseHoles = False,
     save_cameras: Annotated[
         Path | None,
         typer.Option(

@@ -7,6 +7,7 @@ import typer
 
 from ..cameras.formats import CameraFormat
 from ..reconstruction.quality import Quality
+from ..views.exposure_mode import ExposureMode
 from .config_file import read_config
 
 
@@ -144,5 +145,74 @@ Refine = Annotated[
         help="Steps of refinement on the images, one image each, or its time such as 30s; 0 for none. Else as "
         "--quality says.",
         metavar="N|SECONDSs",
+    ),
+]
+Views = Annotated[
+    str | None,
+    typer.Option(
+        help="How many images to use, those with the best baselines; else as --quality says, or all of --select.",
+        metavar="N|all",
+    ),
+]
+Select = Annotated[
+    str | None, typer.Option(help="Images to use: names, numbers from 0, 0-3 or 0:8:2, with commas between.")
+]
+Crop = Annotated[bool, typer.Option("--crop", help="Use the middle of the images at the model's trained size.")]
+Offset = Annotated[
+    str | None,
+    typer.Option(
+        help="Write coordinates relative to this, where they are large (surveys): `auto` finds it if it is needed.",
+        metavar="auto|X,Y,Z",
+    ),
+]
+Exposure = Annotated[
+    ExposureMode,
+    typer.Option(help="Bring images of differing exposure and white balance to a common one, or leave them."),
+]
+
+FILTERS = "Filters (off unless asked for)"
+MinOpacity = Annotated[
+    float, typer.Option(help="Leave out Gaussians of lower opacity, 0 to 1.", rich_help_panel=FILTERS)
+]
+CropBorder = Annotated[
+    int, typer.Option(help="Leave out this many pixels along every image's edges.", rich_help_panel=FILTERS)
+]
+DepthJump = Annotated[
+    float,
+    typer.Option(
+        help="Leave out pixels whose depth differs from a neighbour's by more than this share, such as 0.05.",
+        rich_help_panel=FILTERS,
+    ),
+]
+MinConsistency = Annotated[
+    float,
+    typer.Option(
+        help="Leave out pixels whose depth a smaller share of the other views confirms, such as 0.5.",
+        rich_help_panel=FILTERS,
+    ),
+]
+RemoveContradicted = Annotated[
+    bool,
+    typer.Option(
+        "--remove-contradicted",
+        help="Leave out what other views see through, with three views or more (--quality standard and high do).",
+        rich_help_panel=FILTERS,
+    ),
+]
+MergeDuplicates = Annotated[
+    bool,
+    typer.Option(
+        "--merge-duplicates",
+        help="Make one Gaussian of those that views put at the same place.",
+        rich_help_panel=FILTERS,
+    ),
+]
+CloseHoles = Annotated[
+    bool,
+    typer.Option(
+        "--close-holes",
+        help="Fit the Gaussians' shapes to the surface, and let the background go on behind edges (--quality "
+        "standard and high do).",
+        rich_help_panel=FILTERS,
     ),
 ]

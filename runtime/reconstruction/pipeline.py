@@ -36,7 +36,7 @@ def reconstruct(
     images: Images,
     cameras: Path | str | Sequence[Camera] | None = None,
     *,
-    model: Path | str | ModelFiles | None = None,
+    model: Path | str | ModelFiles | Predictor | None = None,
     camera_format: CameraFormat | str | None = None,
     focal: str | None = None,
     select: str | None = None,
@@ -64,7 +64,8 @@ def reconstruct(
     cameras: a file or folder of any known format (`camera_format` where its content does not tell it); `Camera`s, one
     for each array, or whose names are those of the image files; "estimate"; or None for the cameras beside the images,
     estimated where there are none (`focal`: focal length in pixels such as "1375", or on 35 mm film such as "26mm").
-    model: a .onnx file or staged folder instead of the bundled model, or the name of one (`find_model`).
+    model: a .onnx file or staged folder instead of the bundled model, or the name of one (`find_model`); or a
+    `Predictor`, which stays open for further scenes, and has a provider and a session already.
     provider: the ONNX Runtime execution provider, or "auto". session: its device and options, and threads.
     select: images to use, as names or numbers ("0-3", "0:8:2"). views: how many of them, by the best baselines, or
     "all"; by default as many as the quality says, or all that `select` names.
@@ -87,7 +88,8 @@ def reconstruct(
     parse_offset(offset or "auto")
     mode = parse_exposure_mode(exposure)
     with reporting_to(progress or CALLBACK.get()):
-        files = model if isinstance(model, ModelFiles) else read_model(find_model(model))
+        opened = model if isinstance(model, Predictor) else None
+        files = _files_of(model)
         plan = make_plan(quality, files, refine, filters or FilterOptions(), max_gaussians)
         started = time.perf_counter()
         request = Request(
@@ -109,22 +111,23 @@ def reconstruct(
             on_inputs(inputs)
         prepared = time.perf_counter()
         with working("loading the model"):
-            predictor = Predictor(files, provider, session)
+            predictor = opened or Predictor(files, provider, session)
+        load_seconds = 0.0 if opened else predictor.load_seconds
         loaded = time.perf_counter()
         ran_on = predictor.provider.name
         if provider.lower() == AUTO:
             inputs.notes.append(f"ran on {ran_on}")
-        LOG.info("loaded %s on %s in %.2f s", files.path, ran_on, predictor.load_seconds)
+        LOG.info("loaded %s on %s in %.2f s", files.path, ran_on, load_seconds)
         with working("finding near and far"):
             span = predictor.depth_range(inputs.views, near, far)
         with working("comparing exposures"):
             exposed, found = compensate_exposure(inputs.views, mode)
         placed, notes = apply_offset(exposed, offset, span.near)
-        seconds = {"load": predictor.load_seconds, "prepare": prepared - started + time.perf_counter() - loaded}
+        seconds = {"load": load_seconds, "prepare": prepared - started + time.perf_counter() - loaded}
         with working("predicting depth and Gaussians"):
             prediction = predict_views(predictor, placed, span)
         LOG.info("predicted in %s", ", ".join(f"{name} {value:.2f} s" for name, value in prediction.seconds.items()))
-        del predictor  # its memory is needed for the refinement
+        del predictor  # its memory is needed for the refinement, unless the caller keeps it open
         seconds |= prediction.seconds
         fused = fuse(prediction, placed, span, plan.filters)
         finished = refine_prediction(fused.prediction, placed, plan, on_step)
@@ -140,6 +143,12 @@ def reconstruct(
         found,
         finished.psnr,
     )
+
+
+def _files_of(model: Path | str | ModelFiles | Predictor | None) -> ModelFiles:
+    if isinstance(model, Predictor):
+        return model.model
+    return model if isinstance(model, ModelFiles) else read_model(find_model(model))
 
 
 def _check_depth_bounds(near: float | None, far: float | None) -> None:

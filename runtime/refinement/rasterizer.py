@@ -1,6 +1,5 @@
 """Rendering with gradients: the compiled kernels on the machine's cores."""
 
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -8,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..system.compilation import compiling
+from ..system.threads import thread_count
 from . import kernels
 
 NEAR = 0.01  # world units
@@ -86,7 +86,7 @@ class GradientRasterizer:
     _pool: ThreadPoolExecutor = field(init=False)
 
     def __post_init__(self) -> None:
-        self._pool = ThreadPoolExecutor(min(MOST_THREADS, os.cpu_count() or 1))
+        self._pool = ThreadPoolExecutor(min(MOST_THREADS, thread_count()))
         count = len(self.parameters)
         self._projected = np.zeros((count, kernels.PROJECTED), self.parameters.means.dtype)
         self._boxes = np.zeros((count, 4), np.int32)

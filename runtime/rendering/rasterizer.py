@@ -8,7 +8,6 @@ skipped. `rasterizer_numpy` holds the same steps in NumPy: the reference that th
 """
 
 import functools
-import os
 from concurrent.futures import ThreadPoolExecutor
 from math import ceil, inf
 from types import ModuleType
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
 from ..errors import InputError
+from ..system.threads import thread_count
 from .types import BLOCK_SIZE, GaussianArrays, Rendering, Splats, View
 
 # NumPy sorts 16-bit integers by radix, several times faster than wider ones, so a band has no more pixels than this.
@@ -62,7 +62,7 @@ def rasterize(
     band_rows = min(ceil(height / MIN_BANDS), MAX_BAND_PIXELS // width)
     sums = np.empty((height, width, 5), np.float32)  # red, green, blue, depth, alpha
 
-    threads = min(MAX_THREADS, os.cpu_count() or 1)
+    threads = min(MAX_THREADS, thread_count())
     kernels = _kernels()
     with ThreadPoolExecutor(threads) as pool:
         starts = range(0, max(len(gaussians.means), 1), BLOCK_SIZE)

@@ -6,12 +6,12 @@ Only a surface that is supported itself speaks against a point, so that a wrong 
 Of what is left, few copies of each surface stay.
 """
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
 from ..system.compilation import compiled
+from ..system.threads import thread_count
 from .surfaces import Surfaces, project_to_pixel
 
 DEPTH_TOLERANCE = 0.02  # relative difference in depth up to which two views agree
@@ -39,7 +39,7 @@ def find_contradicted(surfaces: Surfaces) -> np.ndarray:
         of_view = s.points[view], colors[view], s.neighbors[view]
         _against(*of_view, s.depth, s.viewmats, s.Ks, least, most, solid, against[view])
 
-    with ThreadPoolExecutor(min(len(s.depth), os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(min(len(s.depth), thread_count())) as pool:
         list(pool.map(count_support, range(len(s.depth))))
         for _ in range(ROUNDS):
             solid = kept & (support > 0)

@@ -1,10 +1,10 @@
 """Closing of holes: shapes that follow the surface, and background that goes on behind depth edges."""
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
+from ..system.threads import thread_count
 from .background import continue_background
 from .gaussians import Gaussians
 from .surface_shape import fit_to_surface
@@ -25,6 +25,6 @@ def close_holes(gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarray) -> G
         fitted = fit_to_surface(own, surfaces, spacings, kept, view)
         return fitted.select(kept[view].ravel()), continue_background(fitted, surfaces, kept, view)
 
-    with ThreadPoolExecutor(min(views, os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(min(views, thread_count())) as pool:
         fitted, continued = zip(*pool.map(close, range(views)), strict=True)
     return Gaussians.concatenate([*fitted, *continued])

@@ -88,7 +88,7 @@ def test_exposures_are_compensated_unless_it_is_switched_off(place, scene):
 
 
 def test_inputs_are_checked_before_the_model_is_loaded(place, scene, monkeypatch):
-    monkeypatch.setattr(pipeline, "Predictor", lambda *given: pytest.fail("loaded"))
+    monkeypatch.setattr(pipeline.Predictor, "__init__", lambda *given: pytest.fail("loaded"))
 
     def fail(inputs) -> None:
         raise InputError(f"not {len(inputs.cameras)}")

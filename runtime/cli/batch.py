@@ -1,0 +1,186 @@
+"""The command `idesplat batch`: many scenes to splat files."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from ..views.exposure_mode import ExposureMode
+from .options import (
+    CamerasFormat,
+    CloseHoles,
+    Config,
+    Crop,
+    CropBorder,
+    DepthJump,
+    Device,
+    Exposure,
+    Far,
+    Focal,
+    MaxGaussians,
+    MergeDuplicates,
+    MinConsistency,
+    MinOpacity,
+    Model,
+    Near,
+    Offset,
+    Overwrite,
+    Provider,
+    ProviderOption,
+    QualityOption,
+    Quiet,
+    Refine,
+    RemoveContradicted,
+    Select,
+    Size,
+    Threads,
+    Verbose,
+    Views,
+)
+from .outputs import command
+from .reporting import note
+from .session_options import session_config
+from .terminal import run, say, warn
+
+SOME_FAILED = 3  # exit status
+MAX_WORKERS = 1024
+
+
+@command("idesplat batch")
+def batch(
+    *,
+    scenes: Annotated[
+        Path,
+        typer.Argument(
+            help="Folder of scene folders; or .jsonl or .csv with the columns id, images, cameras, and options of "
+            "this command by their names, which go before the command line."
+        ),
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder for <id>/scene.ply, <id>/record.json and summary.json.")
+    ],
+    model: Model = None,
+    engine: Annotated[str, typer.Option(help="`local`: processes on this machine.", metavar="local")] = "local",
+    workers: Annotated[
+        int,
+        typer.Option(help="Processes, each with an opened model and its share of cores.", min=1, max=MAX_WORKERS),
+    ] = 1,
+    shard: Annotated[
+        str | None,
+        typer.Option(help="Do every N-th scene from the I-th on, I from 1: one job of an array.", metavar="I/N"),
+    ] = None,
+    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Try again what failed before.")] = False,
+    max_failures: Annotated[
+        int | None, typer.Option(help="Stop after so many failures.", min=1, show_default=False)
+    ] = None,
+    camera_format: CamerasFormat = None,
+    focal: Focal = None,
+    quality: QualityOption = None,
+    views: Views = None,
+    select: Select = None,
+    size: Size = None,
+    crop: Crop = False,
+    refine: Refine = None,
+    max_gaussians: MaxGaussians = 0,
+    near: Near = None,
+    far: Far = None,
+    offset: Offset = None,
+    exposure: Exposure = ExposureMode.AUTO,
+    provider: Provider = "CPU",
+    provider_option: ProviderOption = None,
+    device: Device = None,
+    threads: Threads = None,
+    min_opacity: MinOpacity = 0,
+    crop_border: CropBorder = 0,
+    max_depth_jump: DepthJump = 0,
+    min_consistency: MinConsistency = 0,
+    remove_contradicted: RemoveContradicted = False,
+    merge_duplicates: MergeDuplicates = False,
+    close_holes: CloseHoles = False,
+    overwrite: Overwrite = False,
+    config: Config = None,
+    verbose: Verbose = 0,
+    quiet: Quiet = False,
+) -> None:
+    """Reconstruct many scenes; the same command again does what is missing or changed, and nothing else.
+
+    Prints one line of JSON for each scene, or, on a terminal, progress. The exit status is 3 where some failed.
+    """
+    from ..batch.run import batch as run_batch
+    from ..batch.run import summary_path
+    from ..images.sizes import parse_size
+    from ..inference.inputs import parse_views
+    from ..system.outputs import outputs
+
+    session = session_config(threads, device, provider_option)
+    options: dict[str, Any] = {
+        "camera_format": camera_format,
+        "focal": focal,
+        "quality": quality,
+        "views": parse_views(views) if views else None,
+        "select": select,
+        "size": parse_size(size) if size else None,
+        "crop": crop,
+        "refine": refine,
+        "max_gaussians": max_gaussians,
+        "near": near,
+        "far": far,
+        "offset": offset,
+        "exposure": None if exposure == ExposureMode.AUTO else exposure,
+        "min_opacity": min_opacity,
+        "crop_border": crop_border,
+        "max_depth_jump": max_depth_jump,
+        "min_consistency": min_consistency,
+        "remove_contradicted": remove_contradicted,
+        "merge_duplicates": merge_duplicates,
+        "close_holes": close_holes,
+    }
+    written = summary_path(out, shard)
+    outputs().writes("--out", [written], known=_is_summary(written))
+    summary = run_batch(
+        scenes,
+        out,
+        engine=engine,
+        model=model,
+        options={name: value for name, value in options.items() if value},
+        workers=workers,
+        provider=provider,
+        session=session,
+        shard=shard,
+        retry_failed=retry_failed,
+        max_failures=max_failures,
+        overwrite=overwrite,
+        on_record=_tell,
+    )
+    if sys.stdout.isatty():
+        left = f", {summary.left} left" if summary.left else ""
+        pace = f" in {summary.seconds:.1f} s, {60 * summary.tried / summary.seconds:.3g} scenes/min"
+        note(f"{summary.tried} of {summary.scenes} scenes tried{pace if summary.tried else ''}{left}")
+        note(f"{summary.done} done, {summary.failed} failed: {written}; `idesplat view {out}/ID/scene.ply` shows one")
+    if summary.failed:
+        raise typer.Exit(SOME_FAILED)
+
+
+def main() -> None:
+    """Run the command."""
+    run(batch)
+
+
+def _tell(record: dict[str, Any]) -> None:
+    """One line of JSON for a scene, or on a terminal, where there is progress, only for a failure."""
+    if not sys.stdout.isatty():
+        say(json.dumps(record))
+    elif "error" in record:
+        warn(f"{record['id']}: {record['error']}")
+
+
+def _is_summary(path: Path) -> bool:
+    """Whether a file is what an earlier run has written, maybe on another machine."""
+    from ..batch.run import Summary
+
+    try:
+        return set(json.loads(path.read_bytes())) == set(Summary.__dataclass_fields__)
+    except (OSError, ValueError, TypeError, RecursionError):
+        return False

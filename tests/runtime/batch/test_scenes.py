@@ -1,0 +1,72 @@
+"""The scenes of a batch, from folders and tables."""
+
+import json
+
+import pytest
+from idesplat.runtime.batch.run import choose_shard
+from idesplat.runtime.batch.scenes import Scene, read_scenes
+from idesplat.runtime.errors import InputError
+
+
+@pytest.mark.parametrize(
+    ("row", "said"),
+    [
+        ({"id": "../up", "images": "x"}, "expected a name of a folder"),
+        ({"id": ".", "images": "x"}, "expected a name of a folder"),
+        ({"id": "summary.json", "images": "x"}, "none in .json"),
+        ({"id": "é" * 101, "images": "x"}, "200 bytes at most"),
+        ({"id": "a"}, "expected both"),
+        ({"id": "a", "images": "s3://bucket/a"}, "is a URL, expected a local path"),
+        ({"id": "a", "images": "\0"}, "no file can have this name"),
+        ({"id": "a", "images": "x", "sise": 3}, "unknown column 'sise'"),
+        ({"id": "a", "images": "x", "near": "close"}, "near 'close': expected a number"),
+        ({"id": "a", "images": "x", "crop": 3}, "expected true or false"),
+        ({"id": "a", "images": "x", "quality": "best"}, "expected one of fast, standard, high"),
+        ([1], "expected an object"),
+    ],
+)
+def test_a_bad_row_is_named(tmp_path, row, said):
+    table = tmp_path / "scenes.jsonl"
+    table.write_text(json.dumps(row))
+    with pytest.raises(InputError, match=said):
+        read_scenes(table)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("a.jsonl", "", "is empty"),
+        ("a.jsonl", "\n", "no scene in it"),
+        ("a.jsonl", "{", "cannot be read"),
+        ("a.jsonl", "[" * 100_000, "cannot be read"),
+        ("a.jsonl", '{"id": "a", "images": "x"}\n{"id": "A", "images": "y"}', "id a is given twice"),
+        ("a.csv", "id,images\na,x,more", "unknown column 'None'"),
+        ("a.txt", "a", "is no folder, .jsonl or .csv"),
+    ],
+)
+def test_a_bad_table_is_refused(tmp_path, name, content, said):
+    (tmp_path / name).write_text(content)
+    with pytest.raises(InputError, match=said):
+        read_scenes(tmp_path / name)
+
+
+def test_a_table_gives_paths_beside_it_and_options(tmp_path):
+    table = tmp_path / "scenes.csv"
+    table.write_text(
+        "id,images,cameras,near,views,crop\na,one,one/transforms.json,0.5,3,true\nb,two,,,,\nc,/three,estimate,,,\n"
+    )
+    first, second, third = read_scenes(table)
+    assert (first.images, first.cameras) == (tmp_path / "one", tmp_path / "one" / "transforms.json")
+    assert first.options == {"near": 0.5, "views": 3, "crop": True}
+    assert (second.cameras, second.options) == (None, {})
+    assert (str(third.images), third.cameras) == ("/three", "estimate")
+
+
+def test_shards_share_the_scenes_out(tmp_path):
+    scenes = [Scene(str(number), tmp_path) for number in range(7)]
+    shards = [choose_shard(scenes, f"{number}/3") for number in (1, 2, 3)]
+    assert sorted((scene.id for shard in shards for scene in shard), key=int) == [scene.id for scene in scenes]
+    assert max(map(len, shards)) - min(map(len, shards)) <= 1
+    for wrong in ("0/3", "4/3", "1", "1/", "a/b", "1/0", "-1/2", "²/3"):
+        with pytest.raises(InputError, match="--shard"):
+            choose_shard(scenes, wrong)

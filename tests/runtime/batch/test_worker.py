@@ -1,0 +1,120 @@
+"""What a worker does with a scene, in this process."""
+
+import json
+import shutil
+
+import pytest
+from idesplat.runtime.batch.records import fingerprint, model_sha256, read_record
+from idesplat.runtime.batch.run import batch
+from idesplat.runtime.batch.scenes import Scene
+from idesplat.runtime.batch.worker import Settings, Worker
+from idesplat.runtime.errors import InputError
+from idesplat.runtime.inference.metadata import StageFile, write_manifest
+from idesplat.runtime.inference.model_files import read_model
+from idesplat.runtime.inference.session import DEFAULT
+from tiny_model import NETWORK, write_model
+
+
+@pytest.fixture
+def worker(tmp_path):
+    model = read_model(write_model(tmp_path / "tiny.onnx"))
+    return Worker(Settings(model, model_sha256(model), "CPU", DEFAULT, {}))
+
+
+@pytest.fixture
+def own(scene, tmp_path):
+    """A scene whose files may be changed."""
+    return Scene("a", shutil.copytree(scene, tmp_path / "own"))
+
+
+def test_a_scene_is_done_once(worker, own, tmp_path):
+    record, tried = worker.run(own, tmp_path / "out")
+    assert tried
+    assert record["status"] == "done"
+    assert record == read_record(tmp_path / "out")
+    assert worker.run(own, tmp_path / "out") == (record, False)
+    changed = Scene("a", own.images, options={"views": 3})
+    again, tried = worker.run(changed, tmp_path / "out")
+    assert tried
+    assert (len(record["views"]), len(again["views"])) == (2, 3)
+
+
+def test_a_failure_that_cannot_be_written_is_returned(worker, own, tmp_path):
+    (tmp_path / "out").write_text("a file where a folder is needed, as a disk that is full")
+    record, tried = worker.run(own, tmp_path / "out")
+    assert tried
+    assert record["status"] == "failed"
+    assert "cannot create the folder" in record["error"]
+
+
+def test_a_failure_stands_until_the_inputs_change(worker, own, tmp_path):
+    cameras = own.images / "transforms.json"
+    good = cameras.read_text()
+    cameras.write_text(json.dumps({**json.loads(good), "frames": []}))
+    failing = Scene("a", own.images / "images", cameras)
+    record, tried = worker.run(failing, tmp_path / "out")
+    assert tried
+    assert record["status"] == "failed"
+    assert "Traceback" in (tmp_path / "out" / "error.txt").read_text()
+    assert worker.run(failing, tmp_path / "out") == (record, False)
+    cameras.write_text(good)
+    assert worker.run(failing, tmp_path / "out").record["status"] == "done"
+    assert not (tmp_path / "out" / "error.txt").exists()
+
+
+def test_the_hash_changes_with_what_the_splats_are_made_from(own):
+    def made_from(options=None, model="m", provider="CPU", images=own.images, cameras=None):
+        return fingerprint(Scene("a", images, cameras), options or {}, model, provider)
+
+    before = made_from()
+    (own.images / "notes.txt").write_text("not read")
+    assert made_from() == before
+    others = [
+        made_from({"near": 1.0}),
+        made_from(model="n"),
+        made_from(provider="CUDA"),
+        made_from(images=own.images / "images", cameras="estimate"),
+    ]
+    with (own.images / "transforms.json").open("a") as file:
+        file.write(" ")
+    others.append(made_from())
+    (own.images / "images" / "004.png").unlink()
+    others.append(made_from())
+    assert len({before, *others}) == len(others) + 1
+
+
+def test_a_staged_models_hash_covers_each_file(tmp_path):
+    stages = [StageFile("first", "first.onnx", ["images"], ["depth"]), StageFile("last", "last.onnx", ["depth"], [])]
+    (tmp_path / "staged").mkdir()
+    for stage in stages:
+        write_model(tmp_path / "staged" / stage.file)
+    write_manifest(tmp_path / "staged", stages)
+    before = model_sha256(read_model(tmp_path / "staged"))
+    assert model_sha256(read_model(tmp_path / "staged")) == before
+    write_model(tmp_path / "staged" / "last.onnx", checkpoint="another.ckpt")
+    assert model_sha256(read_model(tmp_path / "staged")) != before
+
+
+def test_nothing_of_others_is_replaced_and_nothing_stands_among_inputs(own, tmp_path):
+    scenes, out = tmp_path / "scenes", tmp_path / "out"
+    shutil.copytree(own.images, scenes / "a")
+    (out / "a").mkdir(parents=True)
+    (out / "a" / "scene.ply").write_text("the user's own")
+    for target, said in ((out, "did not write it"), (scenes / "out", "is an input"), (scenes, "is an input")):
+        with pytest.raises(InputError, match=said):
+            batch(scenes, target, model=tmp_path / "tiny.onnx")
+    with pytest.raises(InputError, match="unknown option 'nears'"):
+        batch(scenes, tmp_path / "new", options={"nears": 1})
+    with pytest.raises(InputError, match="engine 'ray': expected 'local'"):
+        batch(scenes, tmp_path / "new", engine="ray")
+    assert not (tmp_path / "new").exists()
+    assert (out / "a" / "scene.ply").read_text() == "the user's own"
+
+
+@pytest.mark.slow
+def test_a_model_that_cannot_be_opened_ends_the_run_and_leaves_nothing(own, tmp_path):
+    shutil.copytree(own.images, tmp_path / "scenes" / "a")
+    model = write_model(tmp_path / "wrong.onnx", NETWORK.replace("Abs (means)", "Absent (means)"))
+    with pytest.raises(InputError, match="ONNX Runtime cannot load it"):
+        batch(tmp_path / "scenes", tmp_path / "out", model=model)
+    assert not (tmp_path / "out").exists()
