@@ -21,14 +21,22 @@ class Quality(StrEnum):
 
 
 @dataclass(frozen=True)
+class RefinementLimit:
+    """When a refinement ends: after so many steps, or seconds."""
+
+    steps: int
+    seconds: float = inf
+
+
+@dataclass(frozen=True)
 class Preset:
     """A trade of time for quality.
 
     views: how many images are used where neither --views nor --select says it. pixels: least area of the images that
     the network gets; that of its training if larger. fuse: whether Gaussians that other views see through and surplus
     copies of a surface are removed, and holes closed.
-    steps_per_view, seconds: of the refinement, whichever ends first; no steps for none. copy_side: longer side of the
-    images that it fits, in pixels.
+    steps_per_view, seconds: of the refinement, whichever ends first; no steps for none. The seconds are those of
+    `views` images, and grow with their number beyond. copy_side: longer side of the images that it fits, in pixels.
     """
 
     views: int
@@ -38,20 +46,16 @@ class Preset:
     seconds: float
     copy_side: int
 
+    def limit(self, views: int) -> RefinementLimit:
+        """When the refinement on so many images ends."""
+        return RefinementLimit(views * self.steps_per_view, self.seconds * max(1, views / self.views))
+
 
 PRESETS = {
     Quality.FAST: Preset(views=2, pixels=0, fuse=False, steps_per_view=0, seconds=inf, copy_side=COPY_SIDE),
     Quality.STANDARD: Preset(views=8, pixels=0, fuse=True, steps_per_view=20, seconds=40, copy_side=COPY_SIDE),
     Quality.HIGH: Preset(views=24, pixels=1 << 17, fuse=True, steps_per_view=30, seconds=180, copy_side=640),
 }
-
-
-@dataclass(frozen=True)
-class RefinementLimit:
-    """When a refinement ends: after so many steps, or seconds."""
-
-    steps: int
-    seconds: float = inf
 
 
 def parse_refine(text: str) -> RefinementLimit:

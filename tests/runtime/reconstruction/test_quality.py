@@ -47,6 +47,12 @@ def test_refine_overrides_the_quality() -> None:
     assert plan("standard").refinement(6).steps == 6 * PRESETS[Quality.STANDARD].steps_per_view
 
 
+def test_more_images_than_the_quality_takes_have_more_time() -> None:
+    standard = PRESETS[Quality.STANDARD]
+    assert plan("standard").refinement(2).seconds == plan("standard").refinement(standard.views).seconds
+    assert plan("standard").refinement(5 * standard.views).seconds == 5 * standard.seconds
+
+
 def test_a_limit_on_the_gaussians_alone_changes_none_of_those_that_stay() -> None:
     options = plan("fast", max_gaussians=10).refinement(6)
     assert (options.steps, options.max_gaussians, options.max_opacity, options.scale_factor) == (0, 10, 1, 1)
