@@ -197,3 +197,9 @@ def test_nothing_generic_becomes_importable(tmp_path: Path) -> None:
 def test_the_citation_names_this_version() -> None:
     version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
+
+
+def test_test_files_have_names_of_their_own() -> None:
+    """pytest imports test files by their file name alone; a second one of the same name is not collected."""
+    names = [path.name for path in (ROOT / "tests").rglob("test_*.py") if "node_modules" not in path.parts]
+    assert sorted(names) == sorted(set(names))
