@@ -32,6 +32,9 @@ DEFAULT_SETTINGS = GraphSettings()
 # Numbers of views and blocks that differ from every constant in the network; the graph is dynamic in all of them.
 TRACE_VIEWS = 4
 TRACE_BLOCKS = (6, 8)
+# Of the inputs that tell the ranks and constant dimensions of the tensors: few, to save time.
+SMALL_VIEWS = 2
+SMALL_BLOCKS = (2, 3)
 DYNAMIC = {
     "images": {0: "views", 2: "height", 3: "width"},
     "extrinsics": {0: "views"},
@@ -166,15 +169,13 @@ def trace(
     minutes on symbolic shapes, even for a network of a tenth of the size. The exporter is not given the weights, of
     which it would hold several copies.
     """
-    multiple = metadata.size_multiple
-    views = static.views or TRACE_VIEWS
-    height, width = static.size or (TRACE_BLOCKS[0] * multiple, TRACE_BLOCKS[1] * multiple)
-    inputs = tuple(example_inputs(views, height, width, metadata.near, metadata.far).values())
+    inputs = _noise(metadata, static, TRACE_VIEWS, TRACE_BLOCKS)
+    small = _noise(metadata, static, SMALL_VIEWS, SMALL_BLOCKS)
     path, weights = folder / TRACED, folder / TRACED_WEIGHTS
     with warnings.catch_warnings(), torch.no_grad(), chunked(network):
         warnings.simplefilter("ignore")  # the exporter's deprecation, and tracing warnings about static dimensions
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-        shapes = {name: tuple(tensor.shape) for name, tensor in network.named(*inputs).items()}
+        shapes = {name: tuple(tensor.shape) for name, tensor in network.named(*small).items()}
         axes = _dynamic_axes(shapes, static)
         torch.onnx.export(
             network,
@@ -195,6 +196,14 @@ def trace(
     weights.unlink()
     _declare_shapes(model, shapes, axes)
     return model
+
+
+def _noise(
+    metadata: ModelMetadata, static: StaticShape, views: int, blocks: tuple[int, int]
+) -> tuple[torch.Tensor, ...]:
+    """Inputs of noise, of this many views and blocks where the graph's dimensions are dynamic."""
+    height, width = static.size or (blocks[0] * metadata.size_multiple, blocks[1] * metadata.size_multiple)
+    return tuple(example_inputs(static.views or views, height, width, metadata.near, metadata.far).values())
 
 
 def _dynamic_axes(shapes: dict[str, tuple[int, ...]], static: StaticShape) -> dict[str, dict[int, str]]:

@@ -88,13 +88,16 @@ def pytest_configure(config: pytest.Config) -> None:
 
 # Fixtures that export a network, train one, or make the weights of a released one.
 SLOW_FIXTURES = {"exported", "kept_traces", "finished", "released"}
+# Made once for all processes.
+SHARED_FIXTURES = {"exported", "kept_traces"}
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark tests by their fixtures, skip those of POSIX on Windows, and run the files with slow tests first.
 
-    With the slow files first, two processes end at about the same time.
+    With the slow files first, two processes end at about the same time. While one makes what several files share, the
+    other runs slow files that need none of it.
     """
     for item in items:
         fixtures = set(getattr(item, "fixturenames", ()))
@@ -105,7 +108,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if os.name == "nt" and item.get_closest_marker("posix"):
             item.add_marker(pytest.mark.skip(reason="needs POSIX"))
     slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in slow)
+    sharing = {item.path for item in items if SHARED_FIXTURES & set(getattr(item, "fixturenames", ()))}
+    maker = min(sharing, default=None)
+    items.sort(key=lambda item: (item.path != maker, item.path not in slow, item.path in sharing))
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -63,6 +63,7 @@ class _Folder:
         self.graph, self.known = graph, known
         self.constants = {tensor.name for tensor in graph.initializer}
         self.made: dict[Any, str] = {}  # names of integers that were added, by what they are
+        self.scalars: dict[sympy.Expr, str] = {}  # of those, the ones with the value of an expression
         self.replaced: dict[str, str] = {}
         self.producers = {name: node for node in graph.node for name in node.output}
         self.sources = dict(known.sources)
@@ -221,6 +222,12 @@ class _Folder:
 
     def _scalar(self, expression: sympy.Expr) -> str:
         """The name of a tensor [1] with the value of an expression."""
+        if expression not in self.scalars:
+            self.scalars[expression] = self._compute(expression)
+        return self.scalars[expression]
+
+    def _compute(self, expression: sympy.Expr) -> str:
+        """Add what computes an expression, from the inputs' shapes; the name of the result."""
         if expression.is_Integer:
             return self._constant("constant", np.array([int(expression)], np.int64))
         if expression.is_Symbol:

@@ -10,10 +10,12 @@ import onnx
 import pytest
 import torch
 from conftest import SMALL_PRESET, run_command, small_network
+from depthsplat_cases import ONE_SCALE
 from idesplat.export import cli, pipeline
 from idesplat.export.example_inputs import example_inputs
 from idesplat.export.validation.compare import TensorError
 from idesplat.model.family import ErrorQuantiles
+from idesplat.model.registry import PRESETS, build
 from idesplat.runtime.inference.metadata import INPUTS, OUTPUTS, read_manifest, read_metadata
 from idesplat.runtime.inference.predictor import Predictor
 
@@ -103,9 +105,11 @@ def test_manifest_names_the_networks_own_stages(exported):
 
 
 @pytest.mark.slow
-def test_fixed_views_and_size(small_checkpoint, presets, tmp_path, capsys):
-    out = tmp_path / "fixed.onnx"
-    assert run_command(cli.main, small_checkpoint, out, "--views", 2, "--size", "64x64") == 0
+def test_fixed_views_and_size(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(PRESETS, "depthsplat-small-one", ONE_SCALE)
+    out, checkpoint = tmp_path / "fixed.onnx", tmp_path / "depthsplat-small-one.pth"
+    torch.save(build(ONE_SCALE).state_dict(), checkpoint)
+    assert run_command(cli.main, checkpoint, out, "--views", 2, "--size", "64x64") == 0
     shapes = {
         value.name: [dim.dim_value for dim in value.type.tensor_type.shape.dim] for value in onnx.load(out).graph.input
     }
