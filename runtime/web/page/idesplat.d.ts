@@ -14,6 +14,8 @@ export interface Options {
   /** Bounds of depth in the unit of the cameras' positions; found from matched points where not given. */
   near?: number;
   far?: number;
+  /** Without cameras: the focal length of images whose EXIF data has none, equivalent to 35 mm film. */
+  focal?: number;
   onProgress?: (progress: Progress) => void;
   /** Stops the reconstruction. */
   signal?: AbortSignal;
@@ -71,9 +73,26 @@ export interface Reconstruction {
 /** An input that cannot be used; its message says what to do. */
 export class InputError extends Error {}
 
+/** A pinhole camera with or without lens distortion, as `parseColmap` gives it. */
+export interface Camera {
+  name: string;
+  width: number;
+  height: number;
+  /** fx fy cx cy in pixels. */
+  K: number[];
+  /** Camera-to-world, OpenCV's axes, 16 numbers row by row. */
+  pose: number[];
+  /** OpenCV's k1 k2 p1 p2 k3, or k1 to k4 of a fisheye lens. */
+  distortion: number[] | null;
+  fisheye: boolean;
+}
+
+/** The cameras of COLMAP's text model. Throws `InputError`. */
+export function parseColmap(camerasText: string, imagesText: string): Camera[];
+
 /**
- * files: images. cameras: a parsed transforms.json that names them. Two images are used, those of the best baseline.
- * Rejects with `InputError`.
+ * files: images. cameras: a parsed transforms.json that names them, the result of `parseColmap`, or null to estimate
+ * them. Two images are used, those of the best baseline. Rejects with `InputError`.
  */
 export function reconstruct(files: Iterable<File>, cameras: unknown, options?: Options): Promise<Reconstruction>;
 

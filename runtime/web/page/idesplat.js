@@ -5,14 +5,15 @@
  *   const { ply, depth, gaussians } = await reconstruct(files, cameras, { provider: "wasm", onProgress });
  */
 
+import { parseColmap } from "./modules/colmap.js";
 import { InputError } from "./modules/errors.js";
 import { toPly, toSpz } from "./modules/splat_files.js";
 
-export { InputError, toPly, toSpz };
+export { InputError, parseColmap, toPly, toSpz };
 
 /** @type {import("./idesplat.d.ts").reconstruct} */
 export function reconstruct(files, cameras, options = {}) {
-  const { provider = null, near, far, onProgress = () => {}, signal } = options;
+  const { provider = null, near, far, focal, onProgress = () => {}, signal } = options;
   const worker = new Worker(new URL("./worker.js", import.meta.url), { type: "module" });
   const done = new Promise((resolve, reject) => {
     worker.onerror = (event) => reject(new InputError(`the worker failed (${event.message}); reload the page`));
@@ -23,6 +24,6 @@ export function reconstruct(files, cameras, options = {}) {
     };
     signal?.addEventListener("abort", () => reject(new InputError("stopped")));
   });
-  worker.postMessage({ files: [...files], cameras, options: { provider, near, far } });
+  worker.postMessage({ files: [...files], cameras, options: { provider, near, far, focal } });
   return /** @type {any} */ (done.finally(() => worker.terminate()));
 }

@@ -2,7 +2,7 @@
 
 import { reconstruct, toSpz } from "./idesplat.js";
 import { depthCanvas, medianDepth } from "./modules/depth_view.js";
-import { filesOfDrop, readCameraFile, sortFiles } from "./modules/dropped_files.js";
+import { filesOfDrop, readCameraFiles, sortFiles } from "./modules/dropped_files.js";
 
 const RELOADED = "idesplat-reloaded"; // in sessionStorage: the page was reloaded once for cross-origin isolation
 const MEGA = 1e6;
@@ -46,8 +46,9 @@ function addFiles(files) {
   const { images, cameraFiles, others } = sortFiles(files);
   const known = new Set(state.images.map((file) => file.name));
   state.images.push(...images.filter((file) => !known.has(file.name)));
-  if (cameraFiles.length > 0) state.cameraFiles = cameraFiles;
-  showError(others.length > 0 ? `${others[0].name}: is neither an image nor a transforms.json; left out` : null);
+  const replaced = new Set(cameraFiles.map((file) => file.name));
+  state.cameraFiles = [...state.cameraFiles.filter((file) => !replaced.has(file.name)), ...cameraFiles];
+  showError(others.length > 0 ? `${others[0].name}: is neither an image nor a file with cameras; left out` : null);
   showFiles();
 }
 
@@ -64,8 +65,9 @@ function showFiles() {
   element("chosen").replaceChildren(...items);
   const names = state.cameraFiles.map((file) => file.name).join(", ");
   const chosen = state.images.length > 0 || names !== "";
-  const cameras = names ? `Cameras: ${names}` : "No cameras yet: add a transforms.json.";
+  const cameras = names ? `Cameras: ${names}` : "No cameras: they are estimated from the images.";
   element("cameras").textContent = chosen ? `${state.images.length} images. ${cameras}` : "";
+  element("focal-row").hidden = state.images.length === 0 || names !== "";
   element("start").disabled = !chosen;
   element("clear").hidden = !chosen;
 }
@@ -100,10 +102,11 @@ async function start() {
   setRunning(true);
   const started = performance.now();
   try {
-    const cameras = await readCameraFile(state.cameraFiles);
+    const cameras = await readCameraFiles(state.cameraFiles);
     const provider = element("provider").value || null;
+    const focal = element("focal").valueAsNumber;
     const { signal } = controller;
-    const result = await reconstruct(state.images, cameras, { provider, onProgress: showProgress, signal });
+    const result = await reconstruct(state.images, cameras, { provider, focal, onProgress: showProgress, signal });
     await showResult(result, (performance.now() - started) / 1000);
   } catch (error) {
     showError(/** @type {Error} */ (error).message);
@@ -194,6 +197,7 @@ function showNumbers(result, seconds) {
 // ---- events
 
 element("files").addEventListener("change", (event) => addFiles([...event.target.files]));
+element("focal").addEventListener("input", () => (element("focal-value").textContent = `${element("focal").value} mm`));
 element("start").addEventListener("click", start);
 element("stop").addEventListener("click", () => state.stop?.abort());
 element("clear").addEventListener("click", clear);

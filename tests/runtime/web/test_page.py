@@ -9,15 +9,19 @@ import zlib
 from contextlib import contextmanager
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+from camera_cases import colmap_model, known
 from conftest import run_command
 from idesplat.runtime.cameras.camera import Camera
 from idesplat.runtime.cameras.io import read_cameras
 from idesplat.runtime.cli.infer import main as infer
 from idesplat.runtime.cli.web import main as web
 from idesplat.runtime.geometry.intrinsics import intrinsic_matrix
+from idesplat.runtime.images.exif import EXIF_DIRECTORY, FOCAL_LENGTH_35MM
 from idesplat.runtime.rendering.render import render_view
+from idesplat.runtime.sfm.estimate import estimate_cameras
 from idesplat.runtime.splats.gaussians import Gaussians
 from idesplat.runtime.splats.io import read_splats
 from idesplat.runtime.web import third_party
@@ -32,6 +36,18 @@ TIMEOUT_MS = 240_000
 TOLERANCE = 1e-3  # of a standard deviation, in the median
 # Of the viewer's image against the rasteriser's: they sort and filter differently. Upside down it has half as much.
 MIN_PSNR = 26
+# Between the command's estimate and the page's, in units of the median depth: the page matches smaller images.
+MAX_ROTATION_DEG, MAX_SHIFT = 0.5, 0.02
+FOCAL_MM = 29  # of these images, rounded
+# Drops files, given as base64 by name, onto the page.
+DROP = """(files) => {
+  const transfer = new DataTransfer();
+  for (const [name, text] of Object.entries(files)) {
+    const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+    transfer.items.add(new File([bytes], name));
+  }
+  document.getElementById("drop").dispatchEvent(new DragEvent("drop", { dataTransfer: transfer, bubbles: true }));
+}"""
 SETTLED_MS = 4000  # until the viewer has sorted the splats and stopped drawing
 
 
@@ -67,6 +83,22 @@ def expected(captured, exported, tmp_path_factory) -> Gaussians:
     given = ("-i", captured / "images", "-c", captured / "transforms.json", "--model", exported[0])
     assert run_command(infer, *given, "--quality", "fast", "--size", SIZE, "-o", out) == 0
     return read_splats(out)
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory) -> list[Path]:
+    """Two images of a synthetic room, 480 x 640, as JPEG; the first tells its focal length."""
+    from idesplat.tools.synthetic.make_scene import make_scene
+
+    def make(folder: Path) -> None:
+        make_scene(folder, seed=5, views=2, height=480, width=640)
+        for number, path in enumerate(sorted((folder / "images").iterdir())):
+            exif = Image.Exif()
+            if number == 0:
+                exif.get_ifd(EXIF_DIRECTORY)[FOCAL_LENGTH_35MM] = FOCAL_MM
+            Image.open(path).save(folder / f"{path.stem}.jpg", quality=95, exif=exif)
+
+    return sorted(build_once(tmp_path_factory, "two-rooms", make).glob("*.jpg"))
 
 
 @contextmanager
@@ -169,6 +201,75 @@ def test_webgpu_is_refused_for_a_graph_that_was_not_exported_for_it(browser, sit
         page.wait_for_function("document.querySelector('#provider').value === 'wasm'")
     page.close()
     assert answer == "the graph of this page was not exported for WebGPU; choose WebAssembly"
+
+
+def on_page(page, expression: str, argument=None):
+    """What an expression of the page's module gives; the message where it throws."""
+    call = f"(given) => import('./idesplat.js').then((idesplat) => {expression}).catch((error) => error.message)"
+    return page.evaluate(call, argument)
+
+
+def test_colmap_cameras_are_the_commands(browser, site, tmp_path):
+    colmap_model(known(["b/0.jpg", "c.jpg"]), "OPENCV", (510, 500, 301, 251, 0.1, 0.02, 0.001, -0.002)).write_text(
+        tmp_path
+    )
+    expected = {camera.name: camera for camera in read_cameras(tmp_path)}
+    texts = [(tmp_path / name).read_text() for name in ("cameras.txt", "images.txt")]
+    page = browser.new_page()
+    with serving(site) as (address, _):
+        page.goto(address)
+        found = on_page(page, "idesplat.parseColmap(...given)", texts)
+        of_one_file = page.evaluate(
+            "(names) => import('./modules/dropped_files.js').then(({ readCameraFiles }) => readCameraFiles("
+            "names.map((name) => new File(['1'], name)))).catch((error) => error.message)",
+            ["images.txt"],
+        )
+        wrong = on_page(page, "idesplat.parseColmap(...given)", [texts[0].replace(" OPENCV ", " FOV "), texts[1]])
+    page.close()
+    assert sorted(entry["name"] for entry in found) == sorted(expected)
+    for entry in found:
+        camera = expected[entry["name"]]
+        np.testing.assert_allclose(np.reshape(entry["pose"], (4, 4)), camera.extrinsics, atol=1e-9)
+        np.testing.assert_allclose(entry["K"], [*np.diag(camera.K)[:2], *camera.K[:2, 2]])
+        np.testing.assert_allclose(entry["distortion"], [*camera.distortion, 0][:5])
+        assert (entry["width"], entry["height"], entry["fisheye"]) == (camera.width, camera.height, False)
+    assert of_one_file == "images.txt: add cameras.txt, too"
+    assert "has the model FOV, expected SIMPLE_PINHOLE, PINHOLE" in wrong
+
+
+def test_images_alone_are_dropped_and_get_the_commands_cameras(browser, site, rooms, tmp_path):
+    """One image tells its focal length in EXIF data, for the other the slider does."""
+    names = [path.name for path in rooms]
+    given = {path.name: base64.b64encode(path.read_bytes()).decode() for path in rooms}
+    page = browser.new_page()
+    with serving(site) as (address, _):
+        page.goto(address)
+        page.wait_for_function("crossOriginIsolated && navigator.serviceWorker.controller !== null")
+        page.evaluate(DROP, given)
+        page.wait_for_selector("#chosen li >> nth=1")
+        page.focus("#focal")
+        page.evaluate(f"document.activeElement.value = {FOCAL_MM - 1}")
+        page.keyboard.press("ArrowRight")
+        assert page.inner_text("#focal-value") == f"{FOCAL_MM} mm"
+        page.select_option("#provider", "wasm")
+        page.focus("#start")
+        page.keyboard.press("Enter")
+        page.wait_for_selector("#result[data-ready], #error:not([hidden])", timeout=TIMEOUT_MS)
+        assert page.inner_text("#error") == ""
+        assert "the cameras were estimated" in page.inner_text("#notes")
+        found = download(page, "#ply", tmp_path)
+        views = "idesplat.reconstruct(files.files, null, { provider: 'wasm', focal: given }).then((r) => r.cameras)"
+        page.set_input_files("#files", rooms)
+        poses = on_page(page, views, FOCAL_MM)
+    page.close()
+    expected = estimate_cameras(rooms, focal=f"{FOCAL_MM}mm")
+    assert [view["name"] for view in poses] == names
+    for view, camera in zip(poses, expected, strict=True):
+        pose = np.reshape(view["pose"], (4, 4))
+        angle = np.degrees(np.linalg.norm(cv2.Rodrigues(pose[:3, :3].T @ camera.extrinsics[:3, :3])[0]))
+        assert angle < MAX_ROTATION_DEG
+        assert np.linalg.norm(pose[:3, 3] - camera.extrinsics[:3, 3]) < MAX_SHIFT
+    assert len(found.means) == 2 * 64 * 96
 
 
 def huge_png(path: Path) -> Path:

@@ -1,9 +1,12 @@
 /** Files that were dropped or chosen: images, and cameras. */
 
+import { parseColmap } from "./colmap.js";
 import { InputError } from "./errors.js";
 
+const CAMERA_NAME = /(\.json|^cameras\.txt|^images\.txt|^cameras\.bin|^images\.bin)$/i;
+const BESIDE_CAMERAS = /^(points3D|frames|rigs)\.(txt|bin)$/i; // COLMAP's further files, which are not needed
 const IMAGE_NAME = /\.(jpe?g|png|webp|avif|bmp|gif|heic|heif)$/i;
-const MAX_JSON_BYTES = 64e6;
+const MAX_BYTES = 512e6; // of a file with cameras
 
 /** All files of a drop, also those in folders. @param {DataTransfer} transfer @returns {Promise<File[]>} */
 export async function filesOfDrop(transfer) {
@@ -26,20 +29,36 @@ async function filesOfEntry(entry) {
 
 /** @param {File[]} files @returns {{ images: File[], cameraFiles: File[], others: File[] }} */
 export function sortFiles(files) {
-  const images = files.filter((file) => file.type.startsWith("image/") || IMAGE_NAME.test(file.name));
-  const cameraFiles = files.filter((file) => !images.includes(file) && /\.json$/i.test(file.name));
-  const others = files.filter((file) => !images.includes(file) && !cameraFiles.includes(file));
+  const wanted = files.filter((file) => !BESIDE_CAMERAS.test(file.name));
+  const images = wanted.filter((file) => file.type.startsWith("image/") || IMAGE_NAME.test(file.name));
+  const cameraFiles = wanted.filter((file) => !images.includes(file) && CAMERA_NAME.test(file.name));
+  const others = wanted.filter((file) => !images.includes(file) && !cameraFiles.includes(file));
   return { images, cameraFiles, others };
 }
 
-/** The document of the camera file; null without one. @param {File[]} cameraFiles */
-export async function readCameraFile(cameraFiles) {
-  const named = cameraFiles.find((file) => file.name === "transforms.json") ?? cameraFiles[0];
-  if (!named) return null;
-  if (named.size > MAX_JSON_BYTES) throw new InputError(`${named.name}: has ${named.size} bytes, expected a transforms.json`);
+/** The cameras of a parsed transforms.json or of COLMAP's text model; null without files. @param {File[]} cameraFiles */
+export async function readCameraFiles(cameraFiles) {
+  const named = (name) => cameraFiles.find((file) => file.name.toLowerCase() === name);
+  const document = named("transforms.json") ?? cameraFiles.find((file) => /\.json$/i.test(file.name));
+  if (document) return readDocument(document);
+  const [cameras, images] = [named("cameras.txt"), named("images.txt")];
+  if (cameras && images) return parseColmap(await readText(cameras), await readText(images));
+  if (cameras || images) throw new InputError(`${(cameras ?? images)?.name}: add ${cameras ? "images.txt" : "cameras.txt"}, too`);
+  if (cameraFiles.length === 0) return null;
+  const convert = "colmap model_converter --output_type TXT";
+  throw new InputError(`${cameraFiles[0].name}: is COLMAP's binary model, expected the text model; ${convert} writes it`);
+}
+
+async function readDocument(file) {
   try {
-    return JSON.parse(await named.text());
+    return JSON.parse(await readText(file));
   } catch (error) {
-    throw new InputError(`${named.name}: is no JSON (${/** @type {Error} */ (error).message}); save it again`);
+    if (error instanceof InputError) throw error;
+    throw new InputError(`${file.name}: is no JSON (${/** @type {Error} */ (error).message}); save it again`);
   }
+}
+
+async function readText(file) {
+  if (file.size > MAX_BYTES) throw new InputError(`${file.name}: has ${file.size} bytes, expected a file with cameras`);
+  return file.text();
 }

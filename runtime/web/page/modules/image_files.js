@@ -6,18 +6,24 @@ const MAX_SIDE = 16384; // pixels: browsers draw nothing larger
 const MAX_PIXELS = 100e6;
 const HEADER_BYTES = 1 << 18;
 const ORIENTATION = 0x0112;
+const EXIF_DIRECTORY = 0x8769;
+const FOCAL_LENGTH_35MM = 0xa405;
 const SHORT = 3;
+const ENTRY_BYTES = 12;
 
 /**
- * width, height: as stored, before the EXIF rotation; 0 if the format is not known here.
- * @typedef {{ width: number, height: number, orientation: number }} Header
+ * width, height: as stored, before the EXIF rotation; 0 if the format is not known here. focal: equivalent to 35 mm film,
+ * in mm; null if the image does not tell.
+ * @typedef {{ width: number, height: number, orientation: number, focal: number | null }} Header
  */
+
+const UNKNOWN = { width: 0, height: 0, orientation: 1, focal: null };
 
 /** Read and check the header of an image. @param {File} file @returns {Promise<Header>} */
 export async function readHeader(file) {
   if (file.size === 0) throw new InputError(`${file.name}: is empty, expected an image; copy it again`);
   const bytes = new DataView(await file.slice(0, HEADER_BYTES).arrayBuffer());
-  const header = pngHeader(bytes) ?? jpegHeader(bytes) ?? { width: 0, height: 0, orientation: 1 };
+  const header = pngHeader(bytes) ?? jpegHeader(bytes) ?? UNKNOWN;
   if (Math.max(header.width, header.height) > MAX_SIDE || header.width * header.height > MAX_PIXELS) {
     throw new InputError(
       `${file.name}: has ${header.width} x ${header.height} pixels, expected at most ${MAX_SIDE} a side and ` +
@@ -29,12 +35,12 @@ export async function readHeader(file) {
 
 function pngHeader(bytes) {
   if (bytes.byteLength < 24 || bytes.getUint32(0) !== 0x89504e47) return null;
-  return { width: bytes.getUint32(16), height: bytes.getUint32(20), orientation: 1 };
+  return { ...UNKNOWN, width: bytes.getUint32(16), height: bytes.getUint32(20) };
 }
 
 function jpegHeader(bytes) {
   if (bytes.byteLength < 4 || bytes.getUint16(0) !== 0xffd8) return null;
-  const found = { width: 0, height: 0, orientation: 1 };
+  const found = { ...UNKNOWN };
   for (let at = 2; at + 10 <= bytes.byteLength; ) {
     const marker = bytes.getUint16(at);
     if (marker === 0xffe1 && bytes.getUint32(at + 4) === 0x45786966) Object.assign(found, exif(bytes, at + 10));
@@ -46,23 +52,32 @@ function jpegHeader(bytes) {
   return found;
 }
 
-/** Orientation of the EXIF block that starts at `start`. */
+/** Orientation and focal length of the EXIF block that starts at `start`. */
 function exif(bytes, start) {
   const found = {};
   try {
     const little = bytes.getUint16(start) === 0x4949;
-    const first = start + bytes.getUint32(start + 4, little);
-    const count = bytes.getUint16(first, little);
-    for (let entry = first + 2, k = 0; k < count; k++, entry += 12) {
-      const isOrientation = bytes.getUint16(entry, little) === ORIENTATION;
-      if (isOrientation && bytes.getUint16(entry + 2, little) === SHORT) {
-        found.orientation = bytes.getUint16(entry + 8, little);
-      }
-    }
+    const main = directory(bytes, start, bytes.getUint32(start + 4, little), little);
+    if (main.has(ORIENTATION)) found.orientation = main.get(ORIENTATION);
+    const details = main.has(EXIF_DIRECTORY) ? directory(bytes, start, main.get(EXIF_DIRECTORY), little) : new Map();
+    const focal = details.get(FOCAL_LENGTH_35MM) ?? 0;
+    if (focal > 0) found.focal = focal;
   } catch (error) {
     if (!(error instanceof RangeError)) throw error; // a damaged block says nothing
   }
   return found;
+}
+
+/** The whole numbers of a directory of a TIFF structure, by tag. */
+function directory(bytes, start, offset, little) {
+  const first = start + offset;
+  const count = bytes.getUint16(first, little);
+  const values = new Map();
+  for (let k = 0, entry = first + 2; k < count; k++, entry += ENTRY_BYTES) {
+    const short = bytes.getUint16(entry + 2, little) === SHORT;
+    values.set(bytes.getUint16(entry, little), short ? bytes.getUint16(entry + 8, little) : bytes.getUint32(entry + 8, little));
+  }
+  return values;
 }
 
 /** Pixels of an image, upright, RGB, transparency over white. @param {File} file */

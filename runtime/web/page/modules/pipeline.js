@@ -3,6 +3,7 @@
 import { parseTransforms, stem } from "./cameras.js";
 import { depthRange } from "./depth_range.js";
 import { InputError } from "./errors.js";
+import { estimateCameras } from "./estimation.js";
 import { compensateExposure } from "./exposure.js";
 import { decode, readHeader } from "./image_files.js";
 import { norm, positionOf, subtract } from "./linear.js";
@@ -16,8 +17,8 @@ const SAME_POSITION = 1e-9; // relative to the distance from the origin
 /** @typedef {(stage: string, share: number | null) => void} OnProgress share: null where it is not known */
 
 /**
- * @param {File[]} files @param {any} cameras a parsed transforms.json, a list of cameras, or null
- * @param {{ provider?: import("./network.js").Provider | null, near?: number, far?: number }} options
+ * @param {File[]} files @param {any} cameras a parsed transforms.json, a list of cameras, or null to estimate them
+ * @param {{ provider?: import("./network.js").Provider | null, near?: number, far?: number, focal?: number }} options
  * @param {OnProgress} onProgress @param {URL} base folder of the page's files
  */
 export async function run(files, cameras, options, onProgress, base) {
@@ -25,7 +26,7 @@ export async function run(files, cameras, options, onProgress, base) {
   const notes = [];
   onProgress("reading images", null);
   const model = await readModel(base);
-  const pairs = await pairUp(files, cameras, notes);
+  const pairs = await pairUp(files, cameras ?? null, options.focal ?? null, onProgress, notes);
   const views = await chosenViews(pairs, model, onProgress, notes);
   onProgress("finding near and far", null);
   const placed = compareViews(views, model, options, notes);
@@ -53,20 +54,17 @@ function stopwatch() {
   return { seconds, lap };
 }
 
-/** The images that have a camera, with it. */
-async function pairUp(files, cameras, notes) {
+/** The images that have a camera, with it; two of them if the cameras are estimated. */
+async function pairUp(files, cameras, focal, onProgress, notes) {
   if (files.length < 2) {
     const found = files.length === 1 ? "one image" : "no images";
     throw new InputError(`${found} given, expected at least two of the same scene; add images`);
   }
-  if (cameras === null || cameras === undefined) {
-    throw new InputError("no cameras given; add the transforms.json of the images");
-  }
-  const sizes = [];
-  for (const file of files) {
-    const { width, height, orientation } = await readHeader(file);
-    sizes.push(orientation > 4 ? { name: file.name, width: height, height: width } : { name: file.name, width, height });
-  }
+  const headers = await Promise.all(files.map(readHeader));
+  if (cameras === null) return estimateCameras(files, headers.map((header) => header.focal ?? focal), onProgress, notes);
+  const sizes = headers.map(({ width, height, orientation }, index) =>
+    orientation > 4 ? { name: files[index].name, width: height, height: width } : { name: files[index].name, width, height },
+  );
   const known = Array.isArray(cameras) ? cameras : parseTransforms(cameras, sizes);
   const pairs = [];
   for (const file of files) {
@@ -94,7 +92,9 @@ async function chosenViews(pairs, model, onProgress, notes) {
     if (!loaded.has(index)) {
       onProgress(`reading ${pairs[index].file.name}`, null);
       const image = await decode(pairs[index].file);
-      loaded.set(index, makeView(image, pairs[index].camera, height, width));
+      const made = makeView(image, pairs[index].camera, height, width);
+      made.features.found = pairs[index].found ?? null;
+      loaded.set(index, made);
     }
     return loaded.get(index);
   };
