@@ -2,7 +2,8 @@
 
     python -P -m idesplat.tools.training.release runs/tiny/last.ckpt
 
-The verified ONNX graph goes to `runtime/inference/bundled/`, with its checksum.
+The verified ONNX graph goes to `runtime/inference/bundled/`, with its checksum. It is one for the web, which is as fast
+elsewhere, so that the page of `idesplat web` can run it on WebGPU.
 """
 
 import hashlib
@@ -12,6 +13,7 @@ from typing import Annotated
 import typer
 
 from ...export.pipeline import export_checkpoint
+from ...export.targets import WEB
 from ...runtime.cli.terminal import run
 from ...runtime.inference.bundled_model import CHECKSUM_SUFFIX, FOLDER, NAME
 from ...runtime.system.files import atomic_write, make_folder
@@ -25,7 +27,7 @@ def release_bundled_model(
 ) -> None:
     """Export a checkpoint as the bundled model."""
     path = make_folder(FOLDER) / NAME
-    export_checkpoint(checkpoint, path, preset=preset)
+    export_checkpoint(checkpoint, path, preset=preset, target=WEB)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     with atomic_write(path.with_name(NAME + CHECKSUM_SUFFIX)) as temporary:
         temporary.write_text(f"{digest}  {NAME}\n")

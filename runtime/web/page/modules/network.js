@@ -75,7 +75,7 @@ export class Network {
     const graph = new Uint8Array(await fetchFile(new URL(model.file, base), onShare));
     const candidates = asked ? [asked] : ["webgpu", "wasm"];
     for (const provider of candidates) {
-      const problem = provider === "webgpu" ? await webgpuProblem(model) : null;
+      const problem = provider === "webgpu" ? await webgpuProblem(model, asked !== null) : null;
       if (problem) {
         if (asked) throw new InputError(`${problem}; choose WebAssembly`);
         continue;
@@ -122,14 +122,16 @@ async function openWith(provider, base, model, graph) {
   return new Network(ort, session, provider, threads, model);
 }
 
-/** Why WebGPU cannot be used; null if it can. @param {Model} model */
-async function webgpuProblem(model) {
+/** Why WebGPU cannot be used; null if it can. @param {Model} model @param {boolean} inSoftware may be used */
+async function webgpuProblem(model, inSoftware) {
   // ONNX Runtime 1.30 computes some convolutions of other graphs wrongly on WebGPU, without an error.
   if (!model.webgpu) return "the graph of this page was not exported for WebGPU";
   const { gpu } = /** @type {any} */ (navigator);
   if (!gpu) return "this browser has no WebGPU";
   const adapter = await gpu.requestAdapter().catch(() => null);
-  return adapter ? null : "this browser has no WebGPU adapter";
+  if (!adapter) return "this browser has no WebGPU adapter";
+  // WebAssembly is faster than an adapter that computes on the processor.
+  return adapter.info?.isFallbackAdapter && !inSoftware ? "the WebGPU adapter is software" : null;
 }
 
 function firstLine(error) {

@@ -31,17 +31,30 @@ export async function run(files, cameras, options, onProgress, base) {
   onProgress("finding near and far", null);
   const placed = compareViews(views, model, options, notes);
   clock.lap("prepare");
-  const show = (share) => onProgress("loading the model", share);
-  const network = await Network.open(base, model, options.provider ?? null, show, (line) => notes.push(line));
-  clock.lap("load");
-  onProgress("predicting depth and Gaussians", null);
+  const { result, network } = await predictOn(options.provider ?? null, base, model, views, placed, onProgress, notes, clock);
   const { provider, threads } = network;
-  const result = await predict(network, views, placed, model);
-  clock.lap("predict");
   const memory = wasmBytes();
   await network.close();
   const poses = views.map(({ name, camera, intrinsics }) => ({ name, pose: camera.pose, intrinsics }));
   return { ...result, cameras: poses, near: placed.near, far: placed.far, provider, threads, memory, notes, seconds: clock.seconds };
+}
+
+/** The prediction and the network that made it: where WebGPU was not asked for and fails, on WebAssembly. */
+async function predictOn(asked, base, model, views, placed, onProgress, notes, clock) {
+  const show = (share) => onProgress("loading the model", share);
+  const network = await Network.open(base, model, asked, show, (line) => notes.push(line));
+  clock.lap("load");
+  onProgress("predicting depth and Gaussians", null);
+  try {
+    const result = await predict(network, views, placed, model);
+    clock.lap("predict");
+    return { result, network };
+  } catch (error) {
+    if (asked !== null || network.provider !== "webgpu" || !(error instanceof InputError)) throw error;
+    await network.close();
+    notes.push(`${error.message.split(";")[0]}; WebAssembly is used instead`);
+    return predictOn("wasm", base, model, views, placed, onProgress, notes, clock);
+  }
 }
 
 function stopwatch() {
