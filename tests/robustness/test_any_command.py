@@ -20,11 +20,12 @@ from hypothesis import strategies as st
 from idesplat.export import cli as export
 from idesplat.export.released import cli as pull
 from idesplat.runtime.cameras.io import write_cameras
-from idesplat.runtime.cli import batch, convert, infer, models, render, view
+from idesplat.runtime.cli import batch, convert, infer, models, render, view, web
 from idesplat.runtime.cli import cameras as convert_cameras
 from idesplat.runtime.errors import printable
 from idesplat.runtime.inference.metadata import StageFile, write_manifest
 from idesplat.runtime.system.files import SCRATCH_PREFIX
+from idesplat.runtime.web.third_party import VENDOR
 from idesplat.tools.benchmark import cli as bench
 from idesplat.tools.evaluation import cli as evaluate
 from idesplat.tools.training import cli as train
@@ -153,6 +154,10 @@ COMMANDS = {
         8,
     ),
 }
+
+
+if VENDOR.is_dir():  # else the files of the page come from the network
+    COMMANDS["web"] = Command(web.web, web.main, "out/page --model model.onnx --size 32x48", ("model.onnx",), 4)
 
 
 LPIPS_IS_MISSING = "warning: LPIPS is left out, since the package lpips is not installed\n"
@@ -287,8 +292,9 @@ def test_any_call_succeeds_or_changes_nothing(
 
 
 def serves(command: Command, words: list[str]) -> bool:
-    """Whether the call would serve a page until it is interrupted, or trains on scenes of any size."""
-    return command.function is view.view and "--html" not in words and "--help" not in words
+    """Whether the call would serve a page until it is interrupted."""
+    shows = command.function is view.view and "--html" not in words
+    return "--help" not in words and (shows or command.function is web.web and "--serve" in words)
 
 
 def check_result(status: int, out: str, err: str, before: dict, root: Path) -> None:
