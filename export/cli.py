@@ -10,7 +10,7 @@ import typer
 
 from ..runtime.cli.options import Config, Overwrite, Quiet
 from ..runtime.cli.outputs import command
-from ..runtime.cli.reporting import note
+from ..runtime.cli.reporting import mark_printed, note
 from ..runtime.cli.terminal import run, say, warn
 from ..runtime.images.sizes import parse_size
 from .pipeline import MAX_VIEWS, MIN_VIEWS, ExportResult, MismatchError, export_checkpoint
@@ -119,6 +119,7 @@ class _TerminalHandler(logging.Handler):
             warn(f"warning: {record.getMessage()}")
         else:
             note(record.getMessage())
+        mark_printed(record)
 
 
 @contextmanager

@@ -33,11 +33,17 @@ def note(*lines: str) -> None:
         say(*lines)
 
 
+def mark_printed(record: logging.LogRecord) -> None:
+    """Keep a record out of the log on stderr, since its message was printed."""
+    record.printed = True
+
+
 @contextmanager
 def _logging(level: int) -> Iterator[None]:
     """Write what our modules log to stderr."""
     logger, handler = logging.getLogger(__name__.partition(".")[0]), logging.StreamHandler()
     handler.setFormatter(logging.Formatter("%(levelname)s %(name)s: %(message)s"))
+    handler.addFilter(lambda record: not getattr(record, "printed", False))
     before = logger.level
     logger.addHandler(handler)
     logger.setLevel(level)

@@ -294,7 +294,7 @@ def test_any_call_succeeds_or_changes_nothing(
 def serves(command: Command, words: list[str]) -> bool:
     """Whether the call would serve a page until it is interrupted."""
     shows = command.function is view.view and "--html" not in words
-    return "--help" not in words and (shows or command.function is web.web and "--serve" in words)
+    return "--help" not in words and (shows or (command.function is web.web and "--serve" in words))
 
 
 def check_result(status: int, out: str, err: str, before: dict, root: Path) -> None:

@@ -412,8 +412,10 @@ def test_a_weight_of_little_effect_is_compared_too(
 
 
 def test_the_whole_table_is_printed_on_request(small_checkpoint, without_tracing, tmp_path, capsys):
-    assert run_command(cli.main, small_checkpoint, tmp_path / "model.onnx", "--verbose") == 0
-    printed = capsys.readouterr().out
+    assert run_command(cli.main, small_checkpoint, tmp_path / "model.onnx", "-vv") == 0
+    printed, logged = capsys.readouterr()
+    assert "comparing the weights" in logged
+    assert printed.count("reading ") == 1 and "reading " not in logged  # each message is shown once
     assert sum(FUSED in line for line in printed.splitlines()) == 3 * 6
     assert set(INPUTS).isdisjoint(printed.split())
 
