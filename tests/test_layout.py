@@ -24,7 +24,7 @@ FORBIDDEN = {
 ORDERS = {
     "runtime": (
         *("errors", "system", "startup", "geometry", "images", "cameras", "sfm", "views", "splats", "inference"),
-        *("rendering", "refinement", "viewer", "web", "reconstruction", "batch", "cli"),
+        *("rendering", "refinement", "viewer", "web", "reconstruction", "batch", "service", "cli"),
     ),
     "model": ("config", "common", "family", "idesplat", "depthsplat", "registry", "checkpoint"),
     "export": (
