@@ -46,7 +46,6 @@ def make_app(service: Service) -> ASGIApp:
         docs_url=None,  # it loads scripts of another host
         redoc_url=None,
         telemetry={"tracing": False, "metrics": False, "logs": False, "auto_configure": False},
-        max_body_size=service.settings.limits.upload_bytes,
     )
     app.add_exception_handler(Refused, _answer_refused)
     app.add_exception_handler(InputError, _answer_input_error)

@@ -1,12 +1,14 @@
 """The form fields of a request: the options of `idesplat infer` by their names, with `_` for `-`."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..batch.scenes import FILTERS, OPTIONS
 from ..cameras.formats import CameraFormat
 from ..errors import InputError, error_context
+from ..inference.inputs import ALL, select_images
 from ..reconstruction.quality import PRESETS, Quality, parse_refine
 from ..splats.filtering import FilterOptions
 from ..views.exposure_mode import ExposureMode
@@ -65,10 +67,10 @@ FIELDS: dict[str, Field] = {
 }
 
 
-def parse_options(texts: Mapping[str, str], default: Quality, images: int, limits: Limits) -> dict[str, Any]:
+def parse_options(texts: Mapping[str, str], default: Quality, images: Sequence[Path], limits: Limits) -> dict[str, Any]:
     """The options of `reconstruct` and `FilterOptions` in form fields; empty fields count as absent.
 
-    default: the quality where none is asked for. images: how many there are.
+    default: the quality where none is asked for. images: their files.
     Raises InputError for an unknown field or an invalid value, Refused for what is beyond the limits.
     """
     options = {}
@@ -109,11 +111,12 @@ def _check_values(options: Mapping[str, Any]) -> None:
         raise InputError(f"near {near:g} and far {far:g}: expected positive depths, near < far")
 
 
-def _check_limits(options: Mapping[str, Any], default: Quality, images: int, limits: Limits) -> None:
+def _check_limits(options: Mapping[str, Any], default: Quality, images: Sequence[Path], limits: Limits) -> None:
     """Raise Refused for more views or pixels than the service takes."""
     preset = PRESETS[options.get("quality") or default]
-    asked = options.get("views") or (images if options.get("select") else preset.views)
-    views = images if asked == "all" else min(int(asked), images)
+    count = len(select_images(images, options.get("select")))
+    asked = options.get("views") or (ALL if options.get("select") else preset.views)
+    views = count if asked == ALL else min(int(asked), count)
     if views > limits.views:
         raise Refused(413, f"{views} views, expected {limits.views} at most; give `views` or fewer images")
     height, width = options.get("size") or (0, 0)

@@ -155,7 +155,7 @@ class Pool:
         """Have a job done, unless it is cancelled or takes too long."""
         upload = job.upload
         cameras = None if upload.cameras is None else str(upload.cameras)
-        order = Order(str(upload.images), cameras, job.options, str(job.out), job.save_depth, job.render)
+        order = Order(str(upload.folder), cameras, job.options, str(job.out), job.save_depth, job.render)
         work = asyncio.ensure_future(worker.run(order, job.report))
         cancelled = asyncio.ensure_future(job.cancelled.wait())
         try:

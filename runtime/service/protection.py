@@ -17,6 +17,8 @@ OPEN_PATHS = ("/", "/health", "/ready", "/openapi.json")  # and the page's files
 PAGE = "/page/"
 HEADER_S = 10.0  # until the headers of a request are there
 WRITE_S = 60.0  # that a client may leave an answer unread
+# That a request is read on after it was answered: closing at once would reset the connection, and lose the answer.
+LINGER_S = 10.0
 MAX_HEADER_BYTES = 16384
 BEARER = "Bearer "
 HEADERS = {
@@ -50,8 +52,6 @@ class Protection:
                 headers = MutableHeaders(scope=message)
                 for name, value in HEADERS.items():
                     headers.setdefault(name, value)
-                if scope["method"] == "POST" and message["status"] >= 400:
-                    headers["Connection"] = "close"  # what was not read of the request is not waited for
             await send(message)
 
         refusal = self._refusal(scope)
@@ -59,6 +59,8 @@ class Protection:
 
     def _refusal(self, scope: Scope) -> JSONResponse | None:
         headers, path = Headers(scope=scope), scope["path"]
+        if len(path) + sum(len(name) + len(value) for name, value in headers.raw) > MAX_HEADER_BYTES:
+            return JSONResponse({"detail": f"the headers are larger than {MAX_HEADER_BYTES} bytes"}, 431)
         if self._token is None:
             if not is_own_page(self._host, headers.get("host"), headers.get("origin")):
                 return JSONResponse({"detail": "only this machine, and the page that is served here, may ask"}, 403)
@@ -78,6 +80,7 @@ class TimedProtocol(H11Protocol):
 
     _header_timer: TimerHandle | None = None
     _write_timer: TimerHandle | None = None
+    _linger_timer: TimerHandle | None = None
 
     def connection_made(self, transport: Transport) -> None:  # type: ignore[override]
         """Begin to wait for the headers."""
@@ -88,13 +91,22 @@ class TimedProtocol(H11Protocol):
         """Take what comes; headers in small pieces gain no time."""
         super().data_received(data)
         self._watch_headers()
+        if self._linger_timer is not None and self.conn.their_state is not h11.SEND_BODY:
+            self._linger_timer.cancel()
+            self._linger_timer = None
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Forget the timers."""
         super().connection_lost(exc)
-        for timer in (self._header_timer, self._write_timer):
+        for timer in (self._header_timer, self._write_timer, self._linger_timer):
             if timer is not None:
                 timer.cancel()
+
+    def on_response_complete(self) -> None:
+        """Read the rest of a request that was refused before its end, for a while."""
+        super().on_response_complete()
+        if self.conn.their_state is h11.SEND_BODY and self._linger_timer is None:
+            self._linger_timer = self.loop.call_later(LINGER_S, self.transport.close)
 
     def pause_writing(self) -> None:
         """The client does not read as fast as is written."""

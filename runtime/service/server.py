@@ -45,12 +45,11 @@ def serve(settings: Settings, storage: Path | None, on_start: Callable[[str], No
     for temporary files. on_start: called with the service's address.
     Raises InputError if the address cannot be used, or the model cannot be opened.
     """
-    with scratch_folder(storage) as folder:
-        asyncio.run(_serve(settings, folder, on_start))
+    with _listen(settings) as listener, scratch_folder(storage) as folder:
+        asyncio.run(_serve(settings, listener, folder, on_start))
 
 
-async def _serve(settings: Settings, folder: Path, on_start: Callable[[str], None]) -> None:
-    listener = _listen(settings)
+async def _serve(settings: Settings, listener: socket.socket, folder: Path, on_start: Callable[[str], None]) -> None:
     async with Service.running(settings, folder) as service:
         asked = asyncio.Event()
         config = uvicorn.Config(

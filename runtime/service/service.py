@@ -86,11 +86,11 @@ class Service:
             upload = await receive_scene(request, folder, self.settings.limits)
             texts = dict(upload.texts)
             depth, render = (_flag(texts, option, default) for option, default in ((SAVE_DEPTH, True), (RENDER, False)))
-            parse_options(texts, self._default_quality(), upload.count, self.settings.limits)
+            parse_options(texts, self._default_quality(), upload.images, self.settings.limits)
             given = {option: text for option, text in texts.items() if text}
             job = Job(name, folder, upload, given, depth, render)
             self.jobs.add(job)
-        LOG.info("%s: queued, %d images", job.id, upload.count)
+        LOG.info("%s: queued, %d images", job.id, len(upload.images))
         return job
 
     async def scene_file(self, job: Job, ending: str) -> Path:

@@ -3,7 +3,7 @@
 import asyncio
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from starlette.types import Message, Receive
 
 from ..cameras.formats import ESTIMATE
 from ..errors import InputError
-from ..images.finding import SUFFIXES
+from ..images.finding import SUFFIXES, find_images
 from ..images.header import DamagedImage, image_size
 from .archives import CAMERA_SUFFIXES, is_zip, safe_name, unpack
 from .limits import MIB, Limits, Refused
@@ -22,7 +22,7 @@ IMAGES, CAMERAS = "images", "cameras"
 MAX_CAMERA_FILES = 400  # DTU and OpenCV have one a view
 MAX_FIELDS = 64
 MAX_FIELD_BYTES = 4096
-IDLE_S = 20.0  # without a byte of a request's body
+IDLE_S = 10.0  # without a byte of a request's body
 MIN_IMAGES = 2
 # AVIF, HEIC and WebP are parsed by native libraries: their headers are read in the worker process.
 HEADER = 12
@@ -31,31 +31,41 @@ NATIVE = {(4, 8): b"ftyp", (8, 12): b"WEBP"}
 
 @dataclass(frozen=True)
 class Upload:
-    """What a client has sent, as files. images: the folder. cameras: a file or folder, "estimate", or None to look
-    beside the images. count: of images. texts: the other form fields.
+    """What a client has sent, as files. folder: of the images. cameras: a file or folder, "estimate", or None to look
+    beside the images. images: in natural order. texts: the other form fields.
     """
 
-    images: Path
+    folder: Path
     cameras: Path | str | None
-    count: int
+    images: Sequence[Path]
     texts: Mapping[str, str]
 
 
 @dataclass
-class _Deadline:
-    """The `receive` of a request with limits on its time; what comes too slowly is refused."""
+class _LimitedReceive:
+    """The `receive` of a request with limits on its time and size."""
 
     receive: Receive
-    seconds: float
+    limits: Limits
+    size: int = 0
     started: float = field(default_factory=time.monotonic)
 
     async def __call__(self) -> Message:
-        left = self.started + self.seconds - time.monotonic()
+        left = self.started + self.limits.upload_seconds - time.monotonic()
         try:
             async with asyncio.timeout(min(IDLE_S, max(left, 0))):
-                return await self.receive()
+                message = await self.receive()
         except TimeoutError:
             raise Refused(408, "the upload comes too slowly; send fewer or smaller images") from None
+        self.add(len(message.get("body", b"")))
+        return message
+
+    def add(self, size: int) -> None:
+        """Count bytes."""
+        self.size += size
+        if self.size > self.limits.upload_bytes:
+            most = self.limits.upload_bytes / MIB
+            raise Refused(413, f"the upload is larger than {most:g} MiB; send fewer or smaller images")
 
 
 async def receive_scene(request: Request, folder: Path, limits: Limits) -> Upload:
@@ -66,7 +76,10 @@ async def receive_scene(request: Request, folder: Path, limits: Limits) -> Uploa
     kind = request.headers.get("content-type", "")
     if not kind.lower().startswith("multipart/form-data"):
         raise Refused(415, "expected multipart/form-data with the files `images`, and `cameras` if there are any")
-    guarded = Request(request.scope, _Deadline(request.receive, limits.upload_seconds))
+    declared = request.headers.get("content-length", "")
+    if declared.isdecimal():
+        _LimitedReceive(request.receive, limits).add(int(declared))
+    guarded = Request(request.scope, _LimitedReceive(request.receive, limits))
     async with guarded.form(
         max_files=limits.images + MAX_CAMERA_FILES, max_fields=MAX_FIELDS, max_part_size=MAX_FIELD_BYTES
     ) as form:
@@ -85,7 +98,7 @@ def _store(form: FormData, folder: Path, limits: Limits) -> Upload:
             raise Refused(413, f"{len(images)} images, expected {limits.images} at most")
         place, given = folder / IMAGES, ESTIMATE
         _save(images, place, SUFFIXES, "images")
-    count = _check_images(place, limits)
+    found = _check_images(place, limits)
     if cameras:
         _save(cameras, folder / CAMERAS, CAMERA_SUFFIXES, "cameras")
         given = folder / CAMERAS if len(cameras) > 1 else next((folder / CAMERAS).iterdir())
@@ -93,7 +106,7 @@ def _store(form: FormData, folder: Path, limits: Limits) -> Upload:
         if texts[CAMERAS] != ESTIMATE:
             raise InputError(f"cameras: expected files, or the word {ESTIMATE}")
         given = ESTIMATE
-    return Upload(place, given, count, {name: text for name, text in texts.items() if name != CAMERAS})
+    return Upload(place, given, found, {name: text for name, text in texts.items() if name != CAMERAS})
 
 
 def _sorted(form: FormData) -> tuple[list[UploadFile], list[UploadFile], dict[str, str]]:
@@ -140,11 +153,12 @@ def _without_wrapper(folder: Path) -> Path:
     return folder
 
 
-def _check_images(folder: Path, limits: Limits) -> int:
-    """Read every image's header; how many images there are. Raises InputError and Refused."""
-    images = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
-    if len(images) < MIN_IMAGES:
-        raise InputError(f"{len(images)} images, expected {MIN_IMAGES} or more, or one zip of them")
+def _check_images(folder: Path, limits: Limits) -> list[Path]:
+    """Read every image's header; the images. Raises InputError and Refused."""
+    found = [path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES]
+    if len(found) < MIN_IMAGES:
+        raise InputError(f"{len(found)} images, expected {MIN_IMAGES} or more, or one zip of them")
+    images = find_images(found)
     for path in images:
         with path.open("rb") as file:
             start = file.read(HEADER)
@@ -159,4 +173,4 @@ def _check_images(folder: Path, limits: Limits) -> int:
             raise too_large from None
         if width * height > limits.megapixels * 10**6:
             raise too_large
-    return len(images)
+    return images
