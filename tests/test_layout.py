@@ -29,7 +29,7 @@ ORDERS = {
     "model": ("config", "common", "family", "idesplat", "depthsplat", "registry", "checkpoint"),
     "export": (
         *("existing_exports", "targets", "graph", "stages", "example_inputs", "precision", "tracing", "validation"),
-        *("conversion", "calibration_images", "hub", "pipeline", "released", "cli"),
+        *("conversion", "calibration_images", "hub", "triton", "pipeline", "released", "cli"),
     ),
     "tools": ("processes", "synthetic", "training", "evaluation", "benchmark", "figures"),
 }
