@@ -9,6 +9,7 @@ from fastapi import FastAPI, Request
 from fastapi.responses import FileResponse, JSONResponse, Response, StreamingResponse
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import CONTENT_TYPE_LATEST
+from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp
 
 from ..errors import InputError
@@ -49,6 +50,7 @@ def make_app(service: Service) -> ASGIApp:
     )
     app.add_exception_handler(Refused, _answer_refused)
     app.add_exception_handler(InputError, _answer_input_error)
+    app.add_exception_handler(ClientDisconnect, _answer_nobody)
     _add_scenes(app, service)
     _add_probes(app, service)
     app.mount("/page", StaticFiles(directory=PAGE))
@@ -64,6 +66,10 @@ def _answer_refused(request: Request, error: Exception) -> JSONResponse:
 
 def _answer_input_error(request: Request, error: Exception) -> JSONResponse:
     return JSONResponse({"detail": " ".join(str(error).split())}, BAD_INPUT)
+
+
+def _answer_nobody(request: Request, error: Exception) -> JSONResponse:
+    return JSONResponse({"detail": "the connection was lost before the request had ended"}, 400)
 
 
 def _add_scenes(app: FastAPI, service: Service) -> None:

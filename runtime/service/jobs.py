@@ -2,12 +2,13 @@
 
 import asyncio
 import logging
+import os
 import secrets
 import shutil
 import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -77,7 +78,7 @@ class Job:
         """The results by their paths in `out`, with `/`."""
         if self.state is not State.DONE:
             return []
-        return sorted(path.relative_to(self.out).as_posix() for path in self.out.rglob("*") if path.is_file())
+        return sorted(path.relative_to(self.out).as_posix() for path in files_in(self.out))
 
     def report(self, progress: dict[str, Any]) -> None:
         """Take note of progress."""
@@ -256,4 +257,17 @@ class Jobs:
 
 def folder_size(folder: Path) -> int:
     """Bytes of the files in a folder."""
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    size = 0
+    for path in files_in(folder):
+        with suppress(OSError):  # it has been removed meanwhile
+            size += path.stat().st_size
+    return size
+
+
+def files_in(folder: Path) -> list[Path]:
+    """The files in a folder and those below, without hidden ones, which are those that a conversion works on."""
+    found = []
+    for place, folders, names in os.walk(folder):  # `rglob` fails where a folder is removed meanwhile
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        found += [Path(place, name) for name in names if not name.startswith(".")]
+    return found

@@ -22,6 +22,7 @@ LOG = logging.getLogger(__name__)
 MODULE = "idesplat.runtime.service.worker"
 LONGEST_MESSAGE = 1 << 22  # bytes of a line from a worker
 RESTART_S = 2.0  # between attempts to start a worker that ends as it starts
+KILLED = -9  # the status of a process that SIGKILL has ended
 MEMORY = "fewer or smaller images, fewer views or a smaller size may do"
 
 
@@ -94,7 +95,7 @@ class Worker:
     async def _ending(self) -> str:
         await self.end()
         status = self.process.returncode or 0
-        if status == -signal.SIGKILL:
+        if status == KILLED:
             return f"its process was killed, out of memory perhaps; {MEMORY}"
         return f"its process crashed ({signal.Signals(-status).name if status < 0 else f'status {status}'})"
 

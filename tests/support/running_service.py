@@ -28,9 +28,10 @@ class RunningService:
         headers = {"Authorization": f"Bearer {token}"} if token else {}
         return httpx.Client(base_url=self.url, headers=headers, timeout=60, trust_env=False)
 
-    def stored(self) -> list[Path]:
-        """The folders of jobs that have files."""
-        return [path for path in self.storage.glob(".idesplat-tmp-*/*/") if any(path.iterdir())]
+    def jobs(self) -> set[str]:
+        """The folders of jobs."""
+        (folder,) = self.storage.iterdir()
+        return set(os.listdir(folder))
 
     def stop(self, number: int = signal.SIGTERM, seconds: float = 60) -> int:
         """Send a signal; the exit status."""
