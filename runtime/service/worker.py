@@ -131,7 +131,7 @@ def _serve(order: Order, predictor: Predictor, reports: _Reports) -> None:
         with reporting_to(reports.progress), confine_to(root):
             reports.send(done=_reconstruct(order, predictor))
     except InputError as error:
-        reports.send(failed=_without(root, str(error)))
+        reports.send(failed=_without(root, str(error)).replace(str(predictor.model.path), "the model"))
     except MemoryError:
         reports.send(failed="memory ran out; send fewer or smaller images, or ask for fewer views or a smaller size")
     except Exception as error:  # one scene's failure must not end the others

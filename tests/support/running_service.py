@@ -1,7 +1,6 @@
 """A real service in a process of its own, on the loopback address."""
 
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -32,11 +31,6 @@ class RunningService:
         """The folders of jobs."""
         (folder,) = self.storage.iterdir()
         return set(os.listdir(folder))
-
-    def stop(self, number: int = signal.SIGTERM, seconds: float = 60) -> int:
-        """Send a signal; the exit status."""
-        self.process.send_signal(number)
-        return self.process.wait(seconds)
 
 
 @contextmanager

@@ -441,3 +441,24 @@ def test_results_that_are_removed_leave_nothing_behind(service, client, parts):
     while folder.exists() and time.monotonic() < ends:
         time.sleep(0.05)
     assert not folder.exists()
+
+
+@pytest.mark.posix
+def test_a_service_that_is_killed_takes_its_workers_with_it(service):
+    """The last of these tests: no other finds the service."""
+    workers = subprocess.run(["pgrep", "-P", str(service.process.pid)], capture_output=True, text=True).stdout
+    service.process.kill()
+    service.process.wait()
+    ends = time.monotonic() + 30
+    while any(map(is_running, map(int, workers.split()))) and time.monotonic() < ends:
+        time.sleep(0.05)
+    assert workers
+    assert not any(map(is_running, map(int, workers.split())))
+
+
+def is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    return b" Z " not in subprocess.run(["ps", "-o", "stat=", "-p", str(process)], capture_output=True).stdout
