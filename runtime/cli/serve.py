@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from ..errors import InputError
+from ..service.limits import GIB, MIB, TOKEN_VARIABLE, Limits
 from .options import Config, Device, Model, Provider, ProviderOption, Quiet, Threads, Verbose
 from .outputs import command
 from .reporting import note
@@ -16,10 +17,9 @@ from .terminal import run, say
 
 LOOPBACK = "127.0.0.1"
 PORT = 8000
-TOKEN_VARIABLE = "IDESPLAT_TOKEN"
 MAX_WORKERS = 64
-MIB, GIB = 1 << 20, 1 << 30
 LIMITS = "Limits"
+DEFAULTS = Limits()
 
 
 @command("idesplat serve")
@@ -49,20 +49,26 @@ def serve(
     ] = None,
     max_upload: Annotated[
         int, typer.Option(help="Megabytes of an upload, and of what a zip unpacks to.", min=1, rich_help_panel=LIMITS)
-    ] = 512,
-    max_images: Annotated[int, typer.Option(help="Images in an upload.", min=2, rich_help_panel=LIMITS)] = 200,
-    max_megapixels: Annotated[int, typer.Option(help="Of an image.", min=1, max=256, rich_help_panel=LIMITS)] = 64,
-    max_views: Annotated[int, typer.Option(help="Images that a scene uses.", min=2, rich_help_panel=LIMITS)] = 24,
+    ] = DEFAULTS.upload_bytes // MIB,
+    max_images: Annotated[
+        int, typer.Option(help="Images in an upload.", min=2, rich_help_panel=LIMITS)
+    ] = DEFAULTS.images,
+    max_megapixels: Annotated[
+        int, typer.Option(help="Of an image.", min=1, max=256, rich_help_panel=LIMITS)
+    ] = DEFAULTS.megapixels,
+    max_views: Annotated[
+        int, typer.Option(help="Images that a scene uses.", min=2, rich_help_panel=LIMITS)
+    ] = DEFAULTS.views,
     max_size: Annotated[
         str,
         typer.Option(help="A scene may ask to work at as many pixels.", metavar="HEIGHTxWIDTH", rich_help_panel=LIMITS),
-    ] = "1024x1024",
+    ] = "{}x{}".format(*DEFAULTS.size),
     max_queue: Annotated[
         int, typer.Option(help="Scenes that wait; more are answered with 429.", min=1, rich_help_panel=LIMITS)
-    ] = 16,
+    ] = DEFAULTS.queue,
     max_seconds: Annotated[
         float, typer.Option(help="That a scene may run.", min=1, max=86400, rich_help_panel=LIMITS)
-    ] = 600,
+    ] = DEFAULTS.seconds,
     max_memory: Annotated[
         float | None,
         typer.Option(
@@ -75,16 +81,16 @@ def serve(
     max_storage: Annotated[
         float,
         typer.Option(help="Gigabytes of all scenes; the oldest results go first.", min=0.001, rich_help_panel=LIMITS),
-    ] = 10,
+    ] = DEFAULTS.storage_bytes / GIB,
     keep: Annotated[
         float, typer.Option(help="Seconds that results stay.", min=1, max=31_536_000, rich_help_panel=LIMITS)
-    ] = 3600,
+    ] = DEFAULTS.keep_seconds,
     stop_after: Annotated[
         float,
         typer.Option(
             help="Seconds that running scenes get after SIGTERM or Ctrl-C.", min=0, max=86400, rich_help_panel=LIMITS
         ),
-    ] = 30,
+    ] = DEFAULTS.stop_seconds,
     provider: Provider = "CPU",
     provider_option: ProviderOption = None,
     device: Device = None,
@@ -112,7 +118,6 @@ def serve(
     from ..inference.named_models import find_model
     from ..inference.providers import candidates
     from ..inference.session import usable_cores
-    from ..service.limits import Limits
     from ..service.service import Settings
     from ..service.worker import Setup
     from ..system.files import check_writable, make_folder

@@ -35,6 +35,7 @@ UPLOAD_PROBLEMS = PROBLEMS | {
     422: {"model": Problem, "description": "An image, a zip, cameras or an option is invalid"},
     429: {"model": Problem, "description": "The queue is full; Retry-After says when to try again"},
     503: {"model": Problem, "description": "The service stops"},
+    507: {"model": Problem, "description": "There is no room on the service's disk"},
 }
 
 

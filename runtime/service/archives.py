@@ -1,8 +1,10 @@
 """Unpacking an uploaded zip: within limits, and never outside of the folder that it is unpacked to."""
 
+import errno
 import stat
 import struct
 import zipfile
+import zlib
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
@@ -18,6 +20,8 @@ MAX_DEPTH = 8  # folders within each other
 MAX_NAME = 200  # bytes of one part of a path
 CHUNK = 1 << 20
 COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+# What zipfile raises for damaged files.
+DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, NotImplementedError, RuntimeError)
 ENCRYPTED = 1  # flag of an entry
 END, END_SIZE = b"PK\x05\x06", 22  # the record at a zip's end, and its size without the comment
 ZIP64_LOCATOR, ZIP64_LOCATOR_SIZE = b"PK\x06\x07", 20
@@ -48,8 +52,8 @@ def unpack(file: BinaryIO, folder: Path, limits: Limits) -> None:
             left = limits.upload_bytes
             for entry, path in wanted:
                 left -= _extract(archive, entry, folder / path, left)
-    except (zipfile.BadZipFile, EOFError, OSError, ValueError, NotImplementedError, RuntimeError) as error:
-        if isinstance(error, InputError):
+    except DAMAGED as error:
+        if isinstance(error, InputError) or getattr(error, "errno", None) == errno.ENOSPC:
             raise
         raise InputError(f"the zip cannot be unpacked ({printable(str(error))[:200]}); pack it again") from None
 
@@ -87,7 +91,7 @@ def _place(entry: zipfile.ZipInfo) -> Path | None:
         raise InputError(f"the zip holds {printable(name)[:80]!r}, which leads out of it; pack it again")
     if stat.S_ISLNK(entry.external_attr >> 16):
         raise InputError(f"the zip holds {printable(name)[:80]!r}, which is a link; pack the file itself")
-    if entry.is_dir() or any(part.startswith((".", "__MACOSX")) for part in parts):
+    if name.endswith("/") or any(part.startswith((".", "__MACOSX")) for part in parts):
         return None
     if PurePosixPath(name).suffix.lower() not in (*SUFFIXES, *CAMERA_SUFFIXES):
         return None

@@ -4,11 +4,12 @@ from dataclasses import dataclass
 
 MIB = 1 << 20
 GIB = 1 << 30
+TOKEN_VARIABLE = "IDESPLAT_TOKEN"  # environment variable of the token, which workers do not get
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of a service; the options of `idesplat serve` have the same defaults.
+    """Limits of a service.
 
     upload_bytes: of a request, and of what its zip holds, unpacked. images: in an upload. megapixels: of an image.
     views: that a job uses. size: the largest height times width that a request may ask to work at.

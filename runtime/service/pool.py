@@ -14,7 +14,7 @@ from typing import Any
 from ..errors import InputError
 from ..system.limits import IMAGE_MEGAPIXELS
 from .jobs import Job, Jobs, State
-from .limits import Limits
+from .limits import TOKEN_VARIABLE, Limits
 from .worker import Order, Setup, as_line
 
 LOG = logging.getLogger(__name__)
@@ -46,7 +46,7 @@ class Worker:
             stderr=DEVNULL,
             limit=LONGEST_MESSAGE,
             start_new_session=True,  # Ctrl-C in a terminal is for the service, which lets workers finish
-            env=os.environ | {IMAGE_MEGAPIXELS.variable: str(setup.megapixels)},
+            env=_environment() | {IMAGE_MEGAPIXELS.variable: str(setup.megapixels)},
         )
         worker = cls(process)
         try:
@@ -98,6 +98,10 @@ class Worker:
         if status == KILLED:
             return f"its process was killed, out of memory perhaps; {MEMORY}"
         return f"its process crashed ({signal.Signals(-status).name if status < 0 else f'status {status}'})"
+
+
+def _environment() -> dict[str, str]:
+    return {name: value for name, value in os.environ.items() if name != TOKEN_VARIABLE}
 
 
 class Pool:

@@ -18,7 +18,7 @@ from ..reconstruction.quality import Quality
 from ..splats.io import FORMATS
 from ..system.output_names import POINT_ENDINGS
 from .fields import parse_options
-from .jobs import Job, Jobs
+from .jobs import MAX_WAIT_S, Job, Jobs
 from .limits import Limits, Refused
 from .metrics import Metrics
 from .pool import Pool
@@ -83,7 +83,11 @@ class Service:
     async def submit(self, request: Request) -> Job:
         """Receive a scene and queue it. Raises Refused, InputError and HTTPException."""
         with self.jobs.reserve() as (name, folder):
-            upload = await receive_scene(request, folder, self.settings.limits)
+            try:
+                upload = await receive_scene(request, folder, self.settings.limits)
+            except OSError as error:
+                LOG.error("an upload cannot be stored: %s", error)
+                raise Refused(507, "the service cannot store the upload; try again later", MAX_WAIT_S) from None
             texts = dict(upload.texts)
             depth, render = (_flag(texts, option, default) for option, default in ((SAVE_DEPTH, True), (RENDER, False)))
             parse_options(texts, self._default_quality(), upload.images, self.settings.limits)

@@ -9,7 +9,8 @@ import pytest
 import typer
 import yaml
 from idesplat.runtime.cli.application import app
-from idesplat.runtime.cli.serve import PORT, TOKEN_VARIABLE
+from idesplat.runtime.cli.serve import PORT
+from idesplat.runtime.service.limits import TOKEN_VARIABLE
 from idesplat.runtime.service.protection import OPEN_PATHS
 from idesplat.runtime.service.server import CLOSE_S
 from idesplat.runtime.service.service import LINGER_S
