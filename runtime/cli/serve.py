@@ -9,7 +9,7 @@ import typer
 
 from ..errors import InputError
 from ..service.limits import GIB, MIB, TOKEN_VARIABLE, Limits
-from .options import Config, Device, Model, Provider, ProviderOption, Quiet, Threads, Verbose
+from .options import Config, Device, Host, Model, Port, Provider, ProviderOption, Quiet, Threads, Verbose
 from .outputs import command
 from .reporting import note
 from .session_options import session_config
@@ -26,10 +26,8 @@ DEFAULTS = Limits()
 def serve(
     *,
     model: Model = None,
-    host: Annotated[
-        str, typer.Option(help="Address to listen at: 0.0.0.0 for all of this machine's, which needs a token.")
-    ] = LOOPBACK,
-    port: Annotated[int, typer.Option(help="Port to listen at, 0 for any.", min=0, max=65535)] = PORT,
+    host: Host = LOOPBACK,
+    port: Port = PORT,
     token: Annotated[
         str | None,
         typer.Option(

@@ -37,13 +37,14 @@ def test_the_page_makes_splats_of_images(browser, service, scene, scheme, tmp_pa
     page.keyboard.type(TOKEN)  # its field has the focus
     page.keyboard.press("Enter")
     page.wait_for_selector("#result:not([hidden])", timeout=120_000)
-    page.wait_for_function("document.querySelectorAll('#depth img').length === 2")
+    page.wait_for_selector("#frame[src^='blob:']")
+    page.wait_for_selector("#depth img:nth-of-type(2)")
     assert "Gaussians from 000.png" in page.inner_text("#facts")
-    page.wait_for_function("document.getElementById('frame').naturalWidth > 0")
     first = page.get_attribute("#frame", "src")
     page.focus("#position")
     page.keyboard.press("ArrowRight")
-    page.wait_for_function("(first) => document.getElementById('frame').src !== first", arg=first)
+    page.wait_for_selector(f"#frame:not([src='{first}'])")
+    assert page.evaluate("document.getElementById('frame').decode().then(() => true)")
     page.select_option("#format", ".splat")
     with page.expect_download() as download:
         page.click("#download")
