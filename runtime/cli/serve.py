@@ -118,13 +118,10 @@ def serve(
     from ..inference.session import usable_cores
     from ..service.service import Settings
     from ..service.worker import Setup
-    from ..system.files import check_writable, make_folder
 
     session = session_config(threads, device, provider_option)
     candidates(provider)
     files = read_model(find_model(model))
-    if storage is not None:
-        check_writable(make_folder(storage))
     limits = Limits(
         upload_bytes=max_upload * MIB,
         images=max_images,

@@ -11,7 +11,7 @@ from typing import Any
 import uvicorn
 
 from ..errors import InputError
-from ..system.files import scratch_folder
+from ..system.files import check_writable, make_folder, scratch_folder
 from ..viewer.server import address
 from .app import make_app
 from .protection import MAX_HEADER_BYTES, TimedProtocol
@@ -43,10 +43,13 @@ def serve(settings: Settings, storage: Path | None, on_start: Callable[[str], No
 
     storage: the folder for the jobs' files, in a folder of their own that is removed at the end; None for the system's
     for temporary files. on_start: called with the service's address.
-    Raises InputError if the address cannot be used, or the model cannot be opened.
+    Raises InputError if the address or the folder cannot be used, or the model cannot be opened.
     """
-    with _listen(settings) as listener, scratch_folder(storage) as folder:
-        asyncio.run(_serve(settings, listener, folder, on_start))
+    with _listen(settings) as listener:
+        if storage is not None:
+            check_writable(make_folder(storage))
+        with scratch_folder(storage) as folder:
+            asyncio.run(_serve(settings, listener, folder, on_start))
 
 
 async def _serve(settings: Settings, listener: socket.socket, folder: Path, on_start: Callable[[str], None]) -> None:

@@ -50,7 +50,7 @@ def test_what_comes_out_is_counted(tmp_path):
     assert sum(map(len, files_in(tmp_path).values())) <= LIMITS.upload_bytes
 
 
-@tried(100)
+@tried(40)
 @given(data=st.data())
 def test_any_zip_is_unpacked_within_its_folder_or_refused(data):
     names = data.draw(

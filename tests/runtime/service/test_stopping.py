@@ -1,19 +1,21 @@
 """A service without a token, with a limit on time, and how it stops."""
 
 import signal
+import socket
 import subprocess
 import sys
 
 import pytest
 from conftest import run_command
 from idesplat.runtime.cli.serve import main
+from mutations import EXAMPLES, TEXTS
 from running_service import running_service, wait_for
 from tiny_model import write_model
 
 pytestmark = pytest.mark.slow
 
 FAST = {"quality": "fast", "size": "64x96"}
-MAX_SECONDS = 6
+MAX_SECONDS = 5
 
 
 @pytest.fixture(scope="module")
@@ -91,3 +93,18 @@ def test_a_model_that_cannot_be_opened_ends_the_service(tmp_path):
     assert done.stderr.startswith("error: ")
     assert "damaged.onnx" in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("option", ["--host", "--token", "--max-size", "--storage", "--model", "--max-queue", "--keep"])
+def test_odd_values_of_options_are_one_line(option, model, monkeypatch, capsys, tmp_path):
+    """At a port that is in use, so that no service starts."""
+    monkeypatch.delenv("IDESPLAT_TOKEN", raising=False)
+    monkeypatch.chdir(tmp_path)
+    with socket.create_server(("127.0.0.1", 0)) as busy:
+        port = busy.getsockname()[1]
+        for text in TEXTS if EXAMPLES else TEXTS[::5]:
+            assert run_command(main, "--port", port, "--model", model, f"{option}={text}") == 2, text
+            printed = capsys.readouterr()
+            assert (printed.out, printed.err.count("\n")) == ("", 1), text
+            assert printed.err.startswith("error: "), text
+    assert list(tmp_path.iterdir()) == []
