@@ -1,13 +1,16 @@
 """A real service in a process of its own, on the loopback address."""
 
+import asyncio
 import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Coroutine, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import httpx
 
@@ -65,3 +68,9 @@ def wait_for(client: httpx.Client, scene: str, states: tuple[str, ...] = ENDED) 
             return found
         time.sleep(0.05)
     raise AssertionError(found)
+
+
+def complete(coroutine: Coroutine[Any, Any, None]) -> None:
+    """Run a coroutine in a thread: in this one, the browser of other tests has an event loop."""
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(asyncio.run, coroutine).result()

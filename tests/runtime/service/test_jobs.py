@@ -2,21 +2,13 @@
 
 import asyncio
 import time
-from collections.abc import Coroutine
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import pytest
 from idesplat.runtime.service import jobs as module
 from idesplat.runtime.service.jobs import Job, Jobs, State
 from idesplat.runtime.service.limits import Limits, Refused
 from idesplat.runtime.service.uploads import Upload
-
-
-def complete(coroutine: Coroutine[Any, Any, None]) -> None:
-    """Run a coroutine in a thread: in this one, the browser of other tests has an event loop."""
-    with ThreadPoolExecutor(1) as pool:
-        pool.submit(asyncio.run, coroutine).result()
+from running_service import complete
 
 
 def add_job(jobs: Jobs, size: int = 10) -> Job:
