@@ -55,6 +55,13 @@ def export(
             help="Folder for a model hub: onnx/model*.onnx, config.json, model card, checksums.", show_default=False
         ),
     ] = None,
+    triton: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for a model repository of NVIDIA Triton: the fused graph, and an ensemble of the stages.",
+            show_default=False,
+        ),
+    ] = None,
     no_verify: Annotated[
         bool, typer.Option("--no-verify", help="Do not compare the graphs with PyTorch, which takes a minute or so.")
     ] = False,
@@ -92,6 +99,7 @@ def export(
                 calibrate=calibrate,
                 cameras=cameras,
                 hub=hub,
+                triton=triton,
                 overwrite=overwrite,
             )
         except MismatchError as error:
@@ -102,7 +110,7 @@ def export(
         warn("warning: the graphs were not compared with PyTorch (--no-verify)")
     else:
         _print_errors(result, bool(verbose))
-    _print_files(result)
+    _print_files(result, triton)
 
 
 def main() -> None:
@@ -142,9 +150,12 @@ def _print_errors(result: ExportResult | MismatchError, verbose: bool) -> None:
     (print_details if verbose else print_summary)(result.errors)
 
 
-def _print_files(result: ExportResult) -> None:
+def _print_files(result: ExportResult, triton: Path | None) -> None:
     """What was written, and how to use it."""
     say(*(f"wrote {path}" for path in result.files))
+    if triton is not None:
+        say(f"serve it with: tritonserver --model-repository {triton}")
+        return
     graphs = [path for path in result.files if path.is_dir() or path.suffix == ".onnx"]
     for weights in (path for path in result.files if path.suffix == ".data"):
         say(f"{weights.name} holds the weights: move it along with {graphs[0].name}")

@@ -16,6 +16,7 @@ from ..runtime.system.progress import ProgressCallback, reporting_to
 from .targets import GraphSettings, check_opset, parse_target
 
 if TYPE_CHECKING:
+    from ..model.common.network import Network
     from .tracing import StaticShape
     from .validation.compare import TensorError
 
@@ -65,6 +66,7 @@ def export_checkpoint(
     calibrate: Path | str | None = None,
     cameras: Path | str | None = None,
     hub: Path | str | None = None,
+    triton: Path | str | None = None,
     overwrite: bool = False,
     progress: ProgressCallback | None = None,
 ) -> ExportResult:
@@ -72,8 +74,8 @@ def export_checkpoint(
 
     checkpoint: `.ckpt`, `.pth` or `.safetensors`, a released file or one of idesplat-train.
     out: the `.onnx` file. hub: instead, a folder in the layout of model hubs, to which graphs of several exports can be
-    added. staged: a folder for one graph a stage, with a manifest; it is replaced as a whole. One of the three is
-    needed.
+    added. staged: a folder for one graph a stage, with a manifest; it is replaced as a whole. triton: instead of these,
+    a folder for a model repository of NVIDIA Triton, to which several exports can be added. One of the four is needed.
     preset: what the file was trained as, where its tensors and its name do not tell.
     views, size: make the number of views, or the image's height and width, static; else they stay dynamic.
     precision: "float32", "int8" (for CPUs), "int8-qdq" (for TensorRT and QNN) or "fp16" (for GPUs).
@@ -87,8 +89,8 @@ def export_checkpoint(
     error exceeds its bound.
     """
     checkpoint = Path(checkpoint)
-    out, staged, hub, calibrate, cameras = (
-        Path(path) if path is not None else None for path in (out, staged, hub, calibrate, cameras)
+    out, staged, hub, triton, calibrate, cameras = (
+        Path(path) if path is not None else None for path in (out, staged, hub, triton, calibrate, cameras)
     )
     chosen, checked_opset = parse_target(target), check_opset(opset)
     if (calibrate is None) != (cameras is None):
@@ -98,10 +100,13 @@ def export_checkpoint(
         _check_precision(precision, calibrate is not None)
         if hub is not None:
             out = _hub_graph(outputs, hub, out, precision, target)
+        if triton is not None:
+            _check_triton(outputs, triton, out, staged)
         with _os_errors_as_input_errors("choose another name"):
             staged = staged.resolve() if staged is not None and staged.is_symlink() else staged
             outputs.reads("the checkpoint", [checkpoint])
-            _check_targets(outputs, out, staged)
+            if triton is None:
+                _check_targets(outputs, out, staged)
             _check_existing(outputs, out, staged)
         from . import conversion
         from .calibration_images import read_examples
@@ -114,7 +119,10 @@ def export_checkpoint(
         examples = read_examples(calibrate, cameras, metadata) if calibrate and cameras else ()
         settings = GraphSettings(chosen, checked_opset, verify, external_data, examples)
         with _os_errors_as_input_errors("choose a folder on a disk with room for it"):
-            errors, files = conversion.convert(loaded.model, metadata, static, out, staged, settings)
+            if triton is not None:
+                errors, files = _export_repository(outputs, loaded.model, metadata, static, triton, settings)
+            else:
+                errors, files = conversion.convert(loaded.model, metadata, static, out, staged, settings)
         if not files:
             raise MismatchError(errors)
         if hub is not None:
@@ -134,6 +142,36 @@ def _hub_graph(outputs: Outputs, hub: Path, out: Path | None, precision: str, ta
         raise InputError(f"--hub {hub}: is a file, expected a folder")
     outputs.writes("--hub", hub_files(hub))
     return graph_path(hub, precision, target)
+
+
+def _check_triton(outputs: Outputs, triton: Path, out: Path | None, staged: Path | None) -> None:
+    """Raise InputError if nothing can be written there, or other graphs are asked for, too."""
+    if out is not None or staged is not None:
+        raise InputError(f"--triton {triton}: holds the fused graph and the stages; leave out OUT, --staged and --hub")
+    if triton.exists() and not triton.is_dir():
+        raise InputError(f"--triton {triton}: is a file, expected a folder")
+    outputs.make_folder(triton)
+    check_writable(triton)
+
+
+def _export_repository(
+    outputs: Outputs,
+    model: "Network",
+    metadata: ModelMetadata,
+    static: "StaticShape",
+    triton: Path,
+    settings: GraphSettings,
+) -> "tuple[list[TensorError], list[Path]]":
+    """Convert a network, and add its graphs to a repository: the errors, and the models' folders."""
+    from . import conversion
+    from .existing_exports import is_our_graph, working_folder
+    from .triton import GRAPH, STAGED, repository_files, write_repository
+
+    for file in repository_files(triton, metadata, model.stage_names):
+        outputs.writes("--triton", [file], known=is_our_graph(file))
+    with working_folder(triton) as working:
+        errors, files = conversion.convert(model, metadata, static, working / GRAPH, working / STAGED, settings)
+        return errors, write_repository(triton, working, metadata) if files else []
 
 
 @contextmanager
@@ -156,7 +194,7 @@ def require_pytorch() -> None:
 def _check_targets(outputs: Outputs, out: Path | None, staged: Path | None) -> None:
     """Check, before minutes of work, whether the results can be written."""
     if out is None and staged is None:
-        raise InputError("nothing to write: give OUT.onnx, or --staged DIR, or both, or --hub DIR")
+        raise InputError("nothing to write: give OUT.onnx, or --staged DIR, or both, or --hub DIR, or --triton DIR")
     if out is not None:
         if out.suffix != ".onnx":
             raise InputError(f"{out}: the output must end in .onnx")

@@ -24,12 +24,12 @@ FORBIDDEN = {
 ORDERS = {
     "runtime": (
         *("errors", "system", "startup", "geometry", "images", "cameras", "sfm", "views", "splats", "inference"),
-        *("rendering", "refinement", "viewer", "web", "reconstruction", "batch", "cli"),
+        *("rendering", "refinement", "viewer", "web", "reconstruction", "batch", "service", "cli"),
     ),
     "model": ("config", "common", "family", "idesplat", "depthsplat", "registry", "checkpoint"),
     "export": (
         *("existing_exports", "targets", "graph", "stages", "example_inputs", "precision", "tracing", "validation"),
-        *("conversion", "calibration_images", "hub", "pipeline", "released", "cli"),
+        *("conversion", "calibration_images", "hub", "triton", "pipeline", "released", "cli"),
     ),
     "tools": ("processes", "synthetic", "training", "evaluation", "benchmark", "figures"),
 }

@@ -1,7 +1,9 @@
 """Finding the images of a camera file, among given images or beside the file, for names and sizes that it lacks."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path, PurePosixPath
 
 from ..images.finding import SUFFIXES, find_images, image_stem
@@ -13,11 +15,26 @@ GIVE_IMAGES = "give the images with --images, which idesplat cameras convert tak
 IMAGE_FOLDERS = ("images", "image", "blended_images")
 MAX_PARENTS = 3
 
+_CONFINED: ContextVar[Path | None] = ContextVar("_CONFINED", default=None)
+
+
+@contextmanager
+def confine_to(folder: Path) -> Iterator[None]:
+    """In the block, look for images in this folder alone, whatever paths a camera file names.
+
+    For cameras of somebody who may not learn which other images there are.
+    """
+    token = _CONFINED.set(folder.resolve())
+    try:
+        yield
+    finally:
+        _CONFINED.reset(token)
+
 
 def image_roots(cameras: Path) -> list[Path]:
     """The folder of a camera file (or `cameras` itself, if it is a folder) and its parents that may hold the images."""
     folder = cameras if os.path.isdir(cameras) else cameras.parent
-    return [folder, *folder.resolve().parents[:MAX_PARENTS]]
+    return [folder, *filter(_is_allowed, folder.resolve().parents[:MAX_PARENTS])]
 
 
 class ImageSizes:
@@ -46,7 +63,7 @@ class ImageSizes:
 def candidate_paths(folder: Path, name: str) -> list[Path]:
     """Paths of an image in a folder, by a name that may lack the suffix."""
     beside = os.path.join(folder, name.replace("\\", "/"))
-    return [Path(beside + suffix) for suffix in ("", *SUFFIXES)]
+    return [path for suffix in ("", *SUFFIXES) if _is_allowed(path := Path(beside + suffix))]
 
 
 def images_in_folder(folder: Path) -> list[Path]:
@@ -54,3 +71,8 @@ def images_in_folder(folder: Path) -> list[Path]:
     if not folder.is_dir() or not any(path.suffix.lower() in SUFFIXES for path in folder.iterdir()):
         return []
     return sorted(find_images([folder]))
+
+
+def _is_allowed(path: Path) -> bool:
+    root = _CONFINED.get()
+    return root is None or Path(os.path.realpath(path)).is_relative_to(root)

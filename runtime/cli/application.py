@@ -24,6 +24,7 @@ class SubCommand(NamedTuple):
 COMMANDS = {
     "infer": SubCommand(".infer", "infer", "Photographs to a 3D Gaussian splat, depth maps and rendered views."),
     "batch": SubCommand(".batch", "batch", "Many scenes to splats, on this machine."),
+    "serve": SubCommand(".serve", "serve", "Reconstruct scenes for clients over HTTP, with a page to try it."),
     "export": SubCommand("...export.cli", "export", "A checkpoint to ONNX, verified against PyTorch."),
     "models": SubCommand(".models", "models", "List the models that --model takes by name."),
     "pull": SubCommand("...export.released.cli", "pull", "Download a released model, and export it into the cache."),

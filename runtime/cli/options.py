@@ -101,6 +101,8 @@ Json = Annotated[Path | None, typer.Option("--json", help="Write a summary as JS
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace existing files that idesplat did not write, too; never inputs.")
 ]
+Host = Annotated[str, typer.Option(help="Address to serve at; other machines do not see the default.")]
+Port = Annotated[int, typer.Option(help="Port to serve at, 0 for any.", min=0, max=65535)]
 
 GENERAL = "Every command"
 Config = Annotated[

@@ -12,7 +12,7 @@ import typer
 from ..cameras.io import CameraFormat
 from ..errors import InputError, Terminated
 from ..system.outputs import outputs
-from .options import Cameras, CamerasFormat, Config, Images, MoreImages, Overwrite, Quiet, Verbose
+from .options import Cameras, CamerasFormat, Config, Host, Images, MoreImages, Overwrite, Port, Quiet, Verbose
 from .outputs import command
 from .terminal import run, say
 
@@ -34,8 +34,8 @@ def view(
     html: Annotated[
         Path | None, typer.Option(help="Write one .html that opens anywhere, without network, instead of serving.")
     ] = None,
-    host: Annotated[str, typer.Option(help="Address to serve at; other machines do not see the default.")] = LOOPBACK,
-    port: Annotated[int, typer.Option(help="Port to serve at, 0 for any.", min=0, max=65535)] = PORT,
+    host: Host = LOOPBACK,
+    port: Port = PORT,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
     overwrite: Overwrite = False,
     config: Config = None,

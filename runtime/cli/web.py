@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from ..errors import Terminated
-from .options import Config, Model, Overwrite, Quiet, Size, Verbose
+from .options import Config, Model, Overwrite, Port, Quiet, Size, Verbose
 from .outputs import command
 from .terminal import run, say
 
@@ -20,7 +20,7 @@ def web(
     model: Model = None,
     size: Size = None,
     serve: Annotated[bool, typer.Option("--serve", help="Serve the page on this machine, too.")] = False,
-    port: Annotated[int, typer.Option(help="Port to serve at, 0 for any.", min=0, max=65535)] = PORT,
+    port: Port = PORT,
     overwrite: Overwrite = False,
     config: Config = None,
     verbose: Verbose = 0,

@@ -1,0 +1,1 @@
+"""The HTTP service: uploads become jobs, which worker processes reconstruct with an opened model."""
