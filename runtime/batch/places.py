@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 INSTALL = "pip install 'idesplat[remote]'"
 STORES = ("s3", "gs", "gcs", "az", "abfs", "memory")
 LOCAL = "file"
-URL = re.compile(r"([a-zA-Z][a-zA-Z0-9+.-]+):+/")
+URL = re.compile(r"([a-zA-Z][a-zA-Z0-9+.-]+)(?:::|:/)")
 EXPECTED = f"expected a local path, or a URL that begins with {', '.join(f'{name}://' for name in STORES)}"
 
 Place = Path | str  # a local path, or the URL of a store

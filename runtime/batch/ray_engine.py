@@ -4,7 +4,6 @@ import logging
 import os
 import secrets
 import signal
-import sys
 import tempfile
 import threading
 from collections import deque
@@ -120,9 +119,12 @@ class _Pool:
 
 @contextmanager
 def _connected(address: str | None, cpus: int) -> Iterator[ModuleType]:
-    """Ray, connected to a cluster or started here."""
+    """Ray, connected to a cluster or started here.
+
+    Started here, it listens on the loopback address alone, unless the program had imported Ray before.
+    """
     os.environ.update(QUIET)
-    if address is None and "ray" not in sys.modules:
+    if address is None:
         os.environ.update(OWN_RAY)
         os.environ.setdefault(TOKEN, secrets.token_hex(32))
     ray = _import_ray()

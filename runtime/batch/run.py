@@ -15,7 +15,6 @@ from ..inference.model_files import read_model
 from ..inference.named_models import find_model
 from ..inference.providers import CPU, candidates
 from ..inference.session import DEFAULT, SessionConfig, usable_cores
-from ..splats.filtering import FilterOptions
 from ..system.progress import progress
 from .cache import DEFAULT_GB, GB
 from .index import Index
@@ -24,7 +23,7 @@ from .pool import run_in_pool
 from .ray_engine import run_on_ray
 from .records import PLY, Status, check_own, model_sha256, splats_name, write_text
 from .results import open_results
-from .scenes import FILTERS, OPTIONS, Scenes, parse_shard, read_scenes
+from .scenes import Scenes, check_options, parse_shard, read_scenes
 from .worker import Outcome, Settings
 
 MAX_LISTED = 1000  # failures in a summary
@@ -115,13 +114,16 @@ def batch(
     """
     started = time.perf_counter()
     target = parse_place(out)
-    chosen = read_scenes(scenes).of_shard(shard)
+    source = parse_place(scenes)
+    if engine == Engine.RAY:  # its actors need not have this process's current folder
+        source, target = (place.absolute() if isinstance(place, Path) else place for place in (source, target))
+    chosen = read_scenes(source).of_shard(shard)
     _check(engine, address, workers, cache_gb, options or {}, [chosen.source, target])
     candidates(provider)
     splats = splats_name(splat_format)
     if isinstance(target, Path):
         _check_local(chosen, target, None if overwrite else splats)
-    files = read_model(find_model(model))
+    files = read_model(find_model(model).absolute())
     threads = session.threads or (1 if address else max(1, usable_cores() // workers))
     settings = Settings(
         files,
@@ -188,10 +190,7 @@ def _check(
         raise InputError(f"--workers {workers}: expected 1 or more")
     if not 0 <= cache_gb < float("inf"):
         raise InputError(f"--cache-size {cache_gb}: expected a number of gigabytes")
-    unknown = sorted(set(options) - set(OPTIONS))
-    if unknown:
-        raise InputError(f"unknown option {unknown[0]!r}; expected {', '.join(OPTIONS)}")
-    FilterOptions(**{name: options[name] for name in FILTERS if name in options})
+    check_options(options)
     for place in places:
         if isinstance(place, str) and place.startswith("memory:"):
             raise InputError(f"{place}: lives in one process, and a batch has several; use SceneReconstructor")

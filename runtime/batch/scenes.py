@@ -18,6 +18,7 @@ from ..errors import InputError, error_context, raise_input_error
 from ..images.sizes import parse_size
 from ..inference.inputs import parse_views
 from ..reconstruction.quality import Quality
+from ..splats.filtering import FilterOptions
 from ..system.files import open_regular, without_case
 from ..views.exposure_mode import ExposureMode
 from .places import Place, beside, join, open_store, parse_place, store_errors
@@ -123,7 +124,7 @@ def read_scenes(source: Path | str) -> Scenes:
     for scene in _read(place):
         name = without_case(scene.id)  # some file systems take names for one that differ in case alone
         if name in ids:
-            raise_input_error(place, f"id {scene.id} is given twice", "give each scene its own id")
+            raise_input_error(place, f"id {name} is given twice", "give each scene its own id")
         ids.add(name)
     if not ids:
         raise_input_error(place, "no scene in it", EXPECTED)
@@ -139,6 +140,14 @@ def parse_shard(shard: str) -> tuple[int, int]:
     if not 1 <= number <= count:
         raise InputError(f"--shard {shard}: expected a number from 1 to {count}, and how many there are")
     return number, count
+
+
+def check_options(options: Mapping[str, Any]) -> None:
+    """Raise InputError for options that are not in `OPTIONS`, or filters with invalid values."""
+    unknown = sorted(set(options) - set(OPTIONS))
+    if unknown:
+        raise InputError(f"unknown option {unknown[0]!r}; expected {', '.join(OPTIONS)}")
+    FilterOptions(**{name: options[name] for name in FILTERS if name in options})
 
 
 def _read(place: Place) -> Iterator[Scene]:

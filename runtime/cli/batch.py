@@ -166,6 +166,7 @@ def batch(
         "merge_duplicates": merge_duplicates,
         "close_holes": close_holes,
     }
+    on_terminal = sys.stdout.isatty()  # asked before there is progress, which takes the stream
     target = parse_place(out)
     summary_place, page = join(target, summary_name(shard)), join(target, index_name(shard))
     if isinstance(summary_place, Path) and isinstance(page, Path):
@@ -187,9 +188,9 @@ def batch(
         max_failures=max_failures,
         cache_gb=cache_size,
         overwrite=overwrite,
-        on_record=_tell,
+        on_record=_tell_failure if on_terminal else _tell_line,
     )
-    if sys.stdout.isatty():
+    if on_terminal:
         pace = f" in {summary.seconds:.1f} s, {60 * summary.tried / summary.seconds:.3g} scenes/min"
         note(f"{summary.tried} tried{pace if summary.tried else ''}; {summary.describe()}: {summary_place}")
         note(f"open {page} in any browser; `idesplat view {out}/ID/scene.{splat_format}` shows a scene")
@@ -202,11 +203,14 @@ def main() -> None:
     run(batch)
 
 
-def _tell(record: dict[str, Any]) -> None:
-    """One line of JSON for a scene, or on a terminal, where there is progress, only for a failure."""
-    if not sys.stdout.isatty():
-        say(json.dumps(record))
-    elif "error" in record:
+def _tell_line(record: dict[str, Any]) -> None:
+    """One line of JSON for a scene."""
+    say(json.dumps(record))
+
+
+def _tell_failure(record: dict[str, Any]) -> None:
+    """On a terminal, where there is progress, only the error of a failure."""
+    if "error" in record:
         warn(f"{record['id']}: {record['error']}")
 
 
