@@ -4,6 +4,7 @@ import logging
 import os
 import secrets
 import signal
+import socket
 import tempfile
 import threading
 from collections import deque
@@ -22,6 +23,7 @@ LOG = logging.getLogger(__name__)
 
 INSTALL = "pip install 'idesplat[ray]'"
 OBJECT_STORE_BYTES = 80 << 20  # near the least that Ray takes: it holds records alone
+CONNECT_SECONDS = 10
 MAX_STARTS = 3  # in a row, of actors that end before they get a scene
 # A Ray of our own serves this machine alone: on its loopback address, with a token that others do not know.
 OWN_RAY = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0", "RAY_AUTH_MODE": "token"}
@@ -87,7 +89,7 @@ class _Pool:
             except self._ray.exceptions.RayError as error:
                 LOG.warning("an actor ended: %s", " ".join(str(error).split()))
                 self._ray.kill(actor)
-                yield from self._after_end(scene)
+                yield from self._after_end(scene, error)
                 self._start()
                 continue
             self._starts = 0
@@ -104,12 +106,16 @@ class _Pool:
         actor = self._actor_class.remote(*self._arguments)
         self._running[actor.ready.remote()] = actor, None
 
-    def _after_end(self, scene: Scene | None) -> Iterator[Outcome]:
+    def _after_end(self, scene: Scene | None, error: Exception) -> Iterator[Outcome]:
         """What follows from the end of an actor: its scene is done again, or has failed."""
         if scene is None:
             self._starts += 1
             if self._starts >= MAX_STARTS:
-                raise InputError("Ray's actors end as they start; use fewer --workers, or free memory")
+                reason = str(error).strip().splitlines()[-1]
+                raise InputError(
+                    f"Ray's actors end as they start: {reason}; each machine needs this version of idesplat, and "
+                    "memory for its share of --workers"
+                )
         elif scene.id in self._once_killed:
             yield record_killed(scene, self._settings)
         else:
@@ -151,6 +157,8 @@ def _import_ray() -> ModuleType:
         import ray.exceptions
     except ImportError:
         raise InputError(f"--engine ray: Ray is not installed; {INSTALL}") from None
+    if not ray.is_initialized():
+        logging.getLogger("ray").setLevel(logging.CRITICAL)  # what is wrong is in its exceptions
     module: ModuleType = ray
     return module
 
@@ -181,6 +189,9 @@ def _start_here(ray: ModuleType, cpus: int, folder: Path) -> None:
 
 def _connect(ray: ModuleType, address: str) -> None:
     try:
+        host, _, port = address.rpartition(":")
+        if host and port.isdigit():  # Ray itself tries for minutes
+            socket.create_connection((host.strip("[]"), int(port)), CONNECT_SECONDS).close()
         ray.init(address=address, **SILENT)
     except Exception as error:
         line = " ".join(str(error).split())

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from ..errors import InputError
-from ..system.files import atomic_write, make_folder, open_regular, scratch_folder
+from ..system.files import atomic_write, make_folder, open_regular, remove_abandoned_folders, scratch_folder
 from .places import Place, open_store, store_errors
 
 BLOCK_BYTES = 1 << 20
@@ -29,6 +29,9 @@ class Results(Protocol):
 
     def remove(self, name: str) -> None:
         """Remove a file, if there is one."""
+
+    def tidy(self) -> None:
+        """Remove what a killed process left here of a file that it was writing."""
 
     def describe(self, name: str) -> dict[str, Any]:
         """What is kept in the record of a file that was written here, to know it by: its size and hash."""
@@ -71,6 +74,10 @@ class LocalResults:
     def remove(self, name: str) -> None:
         """Remove a file, if there is one."""
         (self.folder / name).unlink(missing_ok=True)
+
+    def tidy(self) -> None:
+        """Remove what a killed process left here."""
+        remove_abandoned_folders(self.folder)
 
     def describe(self, name: str) -> dict[str, Any]:
         """What is kept of a file that was written here, to know it by."""
@@ -119,6 +126,9 @@ class StoreResults:
         with store_errors(f"{self.url}/{name}"):
             if self._store.exists(f"{self._root}/{name}"):
                 self._store.rm_file(f"{self._root}/{name}")
+
+    def tidy(self) -> None:
+        """Do nothing: a store shows no object that was not sent to its end."""
 
     def describe(self, name: str) -> dict[str, Any]:
         """What is kept of a file that was written here, to know it by."""

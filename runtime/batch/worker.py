@@ -117,6 +117,7 @@ class Worker:
         reset_peak()
         try:
             results = open_results(join(self.settings.out, scene.id))
+            results.tidy()
             before = read_record(results) or {}
             inputs = open_inputs(scene, InputCache(self.settings.cache_bytes))
             made_from = self._fingerprint(scene, inputs.hashes())

@@ -26,6 +26,7 @@ SIGNALS = (signal.SIGKILL, signal.SIGTERM)
 BATCH = "from idesplat.runtime.cli.launch import idesplat; idesplat()"
 ACTOR, RAYLET = "ray::_Actor", "raylet/raylet"
 LONGEST = 600.0  # seconds that a run may take
+LATEST = 15.0  # seconds after a process started, at which it is killed at the latest
 POLL = 0.05
 
 
@@ -86,19 +87,23 @@ def _start(arguments: list[str], out: Path) -> subprocess.Popen[bytes]:
 
 
 def _disturb(driver: subprocess.Popen[bytes], rng: random.Random, tell: Callable[[str], object]) -> int:
-    """Send signals at random moments until the driver has ended; how many met a process."""
+    """Send signals at random moments until the driver has ended; how many met a process.
+
+    A moment is counted from when there is such a process: Ray and its actors need seconds to start.
+    """
     met, until = 0, time.monotonic() + LONGEST
-    following = time.monotonic() + rng.uniform(2, 14)  # it takes some seconds until Ray runs
+    victim, moment = rng.choice(VICTIMS), None
     while driver.poll() is None:
         assert time.monotonic() < until, "a run does not end"
-        if time.monotonic() >= following:
-            victim, number = rng.choice(VICTIMS), rng.choice(SIGNALS)
-            found = driver.pid if victim == "driver" else next(_children(driver.pid, victim), None)
-            if found is not None:
-                os.kill(found, number)
-                met += 1
-                tell(f"{number.name} to the {victim}")
-            following = time.monotonic() + rng.uniform(0.5, 6)
+        found = driver.pid if victim == "driver" else next(_children(driver.pid, victim), None)
+        if found is not None and moment is None:
+            moment = time.monotonic() + rng.uniform(0, LATEST)
+        elif found is not None and moment is not None and time.monotonic() >= moment:
+            number = rng.choice(SIGNALS)
+            os.kill(found, number)
+            met += 1
+            tell(f"{number.name} to the {victim}")
+            victim, moment = rng.choice(VICTIMS), None
         time.sleep(POLL)
     return met
 
