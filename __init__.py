@@ -12,6 +12,7 @@ from idesplat.runtime import startup as startup
 
 if TYPE_CHECKING:
     from .export.pipeline import export_checkpoint
+    from .runtime.batch.reconstructor import SceneReconstructor
     from .runtime.batch.run import batch
     from .runtime.cameras.camera import Camera
     from .runtime.cameras.io import read_cameras, write_cameras
@@ -39,6 +40,7 @@ _MODULE_OF = {
     "ModelMetadata": "runtime.inference.metadata",
     "Prediction": "runtime.inference.predictor",
     "Predictor": "runtime.inference.predictor",
+    "SceneReconstructor": "runtime.batch.reconstructor",
     "Reconstruction": "runtime.reconstruction.result",
     "batch": "runtime.batch.run",
     "bundled_model": "runtime.inference.bundled_model",
@@ -66,6 +68,7 @@ __all__ = [
     "Predictor",
     "Reconstruction",
     "Runner",
+    "SceneReconstructor",
     "__version__",
     "batch",
     "bundled_model",

@@ -30,7 +30,7 @@ class Terminated(KeyboardInterrupt):
         self.signal_number = signal_number
 
 
-def raise_input_error(path: Path, what: str, remedy: str) -> NoReturn:
+def raise_input_error(path: Path | str, what: str, remedy: str) -> NoReturn:
     """Raise InputError for a file: what is wrong, and what was expected or the remedy."""
     raise InputError(f"{path}: {what}; {remedy}")
 

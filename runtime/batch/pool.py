@@ -6,32 +6,26 @@ import os
 import signal
 import threading
 from collections import deque
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from itertools import islice
 from multiprocessing.connection import Connection
-from pathlib import Path
-
-import cv2
 
 from ..errors import InputError
-from ..system.outputs import outputs
-from ..system.threads import limit_threads
-from .records import RECORD, Status, read_record, write_record
 from .scenes import Scene
-from .worker import Outcome, Settings, Worker
+from .worker import Outcome, Settings, Worker, record_killed, start_worker
 
 LOG = logging.getLogger(__name__)
 
-KILLED = "its worker process was killed twice, out of memory perhaps; use fewer workers, or fewer or smaller images"
 STDERR = 2
 
 _WORKERS: list[Worker] = []  # one in each process
 
 
 def run_in_pool(
-    scenes: Sequence[Scene], out: Path, workers: int, threads: int, settings: Settings
+    scenes: Iterable[Scene], workers: int, threads: int, settings: Settings
 ) -> Generator[Outcome, None, None]:
     """Run scenes in processes; yields each scene's outcome as it is there.
 
@@ -40,14 +34,32 @@ def run_in_pool(
     threads: of each worker.
     Raises InputError if the model cannot be opened, or processes end before they get a scene.
     """
-    waiting, suspects = deque(scenes), deque[Scene]()
+    waiting, suspects = _Waiting(scenes), deque[Scene]()
     while waiting or suspects:
         with _processes(workers, threads, settings) as pool:
             try:
-                yield from _run_alone(pool, out, suspects)
-                yield from _run_together(pool, out, waiting, suspects, workers)
+                yield from _run_alone(pool, settings, suspects)
+                yield from _run_together(pool, waiting, suspects, workers)
             except BrokenProcessPool:
                 LOG.warning("a worker process was killed; starting it again")
+
+
+class _Waiting:
+    """Scenes that no process has got yet; the next is read when it is asked for."""
+
+    def __init__(self, scenes: Iterable[Scene]) -> None:
+        self._scenes = iter(scenes)
+        self._next = deque(islice(self._scenes, 1))
+
+    def __bool__(self) -> bool:
+        return bool(self._next)
+
+    def peek(self) -> Scene:
+        return self._next[0]
+
+    def pop(self) -> None:
+        self._next.clear()
+        self._next.extend(islice(self._scenes, 1))
 
 
 @contextmanager
@@ -69,28 +81,28 @@ def _processes(workers: int, threads: int, settings: Settings) -> Iterator[Proce
         reader.close()
 
 
-def _run_alone(pool: ProcessPoolExecutor, out: Path, suspects: deque[Scene]) -> Iterator[Outcome]:
+def _run_alone(pool: ProcessPoolExecutor, settings: Settings, suspects: deque[Scene]) -> Iterator[Outcome]:
     """Run scenes one at a time. Raises BrokenProcessPool after a scene whose worker was killed."""
     while suspects:
         scene = suspects.popleft()
         try:
-            outcome = pool.submit(_run, scene, out / scene.id).result()
+            outcome = pool.submit(_run, scene).result()
         except BrokenProcessPool:
-            yield _record_killed(scene, out / scene.id)
+            yield record_killed(scene, settings)
             raise
         yield outcome
 
 
 def _run_together(
-    pool: ProcessPoolExecutor, out: Path, waiting: deque[Scene], suspects: deque[Scene], workers: int
+    pool: ProcessPoolExecutor, waiting: _Waiting, suspects: deque[Scene], workers: int
 ) -> Iterator[Outcome]:
     """Run as many scenes at a time as there are workers; those under way when one is killed become suspects."""
     running: dict[Future[Outcome], Scene] = {}
     try:
         while waiting or running:
             while waiting and len(running) < workers:
-                running[pool.submit(_run, waiting[0], out / waiting[0].id)] = waiting[0]
-                waiting.popleft()
+                running[pool.submit(_run, waiting.peek())] = waiting.peek()
+                waiting.pop()
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 outcome = future.result()
                 del running[future]
@@ -100,26 +112,12 @@ def _run_together(
         raise
 
 
-def _record_killed(scene: Scene, folder: Path) -> Outcome:
-    """The failure of a scene whose worker was killed."""
-    before = read_record(folder) or {}
-    record = {"id": scene.id, "status": Status.FAILED, "error": KILLED, "hash": before.get("hash"), "seconds": None}
-    try:
-        outputs().writes("", [folder / RECORD], known=True)
-        write_record(folder, record)
-    except InputError as error:
-        LOG.warning("%s", error)
-    return Outcome(record, True)
-
-
 def _start(settings: Settings, threads: int, alive: Connection) -> None:
     """Prepare a worker process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the first ends the others
     os.dup2(os.open(os.devnull, os.O_WRONLY), STDERR)  # native libraries' warnings; errors are in the records
     threading.Thread(target=_exit_at_end, args=(alive,), daemon=True).start()
-    limit_threads(threads)
-    cv2.setNumThreads(threads)
-    _WORKERS[:] = [Worker(settings)]
+    _WORKERS[:] = [start_worker(settings, threads)]
 
 
 def _exit_at_end(alive: Connection) -> None:
@@ -127,5 +125,5 @@ def _exit_at_end(alive: Connection) -> None:
     os._exit(1)
 
 
-def _run(scene: Scene, folder: Path) -> Outcome:
-    return _WORKERS[0].run(scene, folder)
+def _run(scene: Scene) -> Outcome:
+    return _WORKERS[0].run(scene)

@@ -2,25 +2,24 @@
 
 import hashlib
 import json
-import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from ..cameras.discovery import find_cameras
 from ..cameras.formats import ESTIMATE
-from ..cameras.io import input_files
-from ..images.finding import find_images, is_video
+from ..errors import InputError
 from ..inference.model_files import ModelFiles, external_files
-from ..system.files import atomic_write, open_regular
+from ..splats.io import FORMATS
+from .inputs import FileHash
+from .results import Results, file_sha256
 from .scenes import Scene
 
 RECORD = "record.json"
-SPLATS = "scene.ply"
+PICTURE = "picture.jpg"
 TRACEBACK = "error.txt"
-BLOCK_BYTES = 1 << 20
+PLY = "ply"
 
 
 class Status(StrEnum):
@@ -29,6 +28,13 @@ class Status(StrEnum):
     STARTED = "started"
     DONE = "done"
     FAILED = "failed"
+
+
+def splats_name(splat_format: str) -> str:
+    """The name of a scene's splat file; raises InputError for an unknown format."""
+    if f".{splat_format}" not in FORMATS:
+        raise InputError(f"--format {splat_format}: expected {', '.join(name[1:] for name in FORMATS)}")
+    return f"scene.{splat_format}"
 
 
 def model_sha256(model: ModelFiles) -> str:
@@ -41,57 +47,61 @@ def model_sha256(model: ModelFiles) -> str:
     return digest.hexdigest()
 
 
-def fingerprint(scene: Scene, options: Mapping[str, Any], model: str, provider: str) -> str:
-    """The hash of a scene's image and camera files, the options, the model, the provider and idesplat's version.
-
-    Raises InputError if there are no images, and OSError if a file cannot be read.
-    """
-    settings = [version("idesplat"), model, provider, sorted(options.items()), str(scene.cameras == ESTIMATE)]
+def fingerprint(
+    scene: Scene, inputs: Sequence[FileHash], options: Mapping[str, Any], model: str, provider: str, splats: str
+) -> str:
+    """The hash of a scene's input files, the options, the model, the provider, the format and idesplat's version."""
+    settings = [version("idesplat"), model, provider, splats, sorted(options.items()), str(scene.cameras == ESTIMATE)]
     digest = hashlib.sha256(json.dumps(settings, default=str).encode())
-    for path in input_paths(scene):
-        digest.update(f"{os.path.relpath(path, scene.images)}\0{file_sha256(path)}\0".encode(errors="surrogateescape"))
+    for name, content in inputs:
+        digest.update(f"{name}\0{content}\0".encode(errors="surrogateescape"))
     return digest.hexdigest()
 
 
-def input_paths(scene: Scene) -> list[Path]:
-    """The image and camera files that a scene is made from. Raises InputError if there are no images."""
-    if scene.cameras is None:
-        found = find_cameras([scene.images])
-        given, cameras = found.images, found.cameras
-    else:
-        given, cameras = [scene.images], None if scene.cameras == ESTIMATE else Path(scene.cameras)
-    images = given if all(path.is_file() and is_video(path) for path in given) else find_images(given)
-    return [*images, *(path for path in input_files(cameras) if path.is_file())] if cameras else list(images)
-
-
-def file_sha256(path: Path) -> str:
-    """The SHA-256 of a file's content."""
-    with open_regular(path) as file:
-        digest = hashlib.sha256()
-        while block := file.read(BLOCK_BYTES):
-            digest.update(block)
-    return digest.hexdigest()
-
-
-def read_record(folder: Path) -> dict[str, Any] | None:
-    """The record in a scene's output folder; None where there is none or it cannot be read."""
+def read_record(results: Results) -> dict[str, Any] | None:
+    """The record in a scene's results; None where there is none or it cannot be read."""
     try:
-        with open_regular(folder / RECORD) as file:
-            record = json.loads(file.read())
-    except (OSError, ValueError, RecursionError):
+        record = json.loads(results.read(RECORD) or b"")
+    except (ValueError, RecursionError):
         return None
     return record if isinstance(record, dict) and record.get("status") in tuple(Status) else None
 
 
-def is_done(folder: Path, record: Mapping[str, Any], made_from: str) -> bool:
-    """Whether a scene was made from these inputs and its splats are there, whole."""
+def is_done(results: Results, record: Mapping[str, Any], made_from: str) -> bool:
+    """Whether a scene was made from these inputs and the files that its record names are there, whole."""
     if record.get("status") != Status.DONE or record.get("hash") != made_from:
         return False
-    splats = folder / SPLATS
-    return splats.is_file() and file_sha256(splats) == record.get("sha256")
+    files = files_of(record)
+    return bool(files) and all(results.is_whole(name, described) for name, described in files.items())
 
 
-def write_record(folder: Path, record: Mapping[str, Any]) -> None:
+def files_of(record: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """The files that a record names, and what it says of them; those alone that a batch may have written."""
+    files = record.get("files")
+    known = {PICTURE, *(splats_name(name[1:]) for name in FORMATS)}
+    if not isinstance(files, dict):
+        return {}
+    return {name: described for name, described in files.items() if name in known and isinstance(described, dict)}
+
+
+def write_record(results: Results, record: Mapping[str, Any]) -> None:
     """Write a record whole or not at all; raises InputError if it cannot be written."""
-    with atomic_write(folder / RECORD) as temporary:
-        temporary.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+    write_text(results, RECORD, json.dumps(record, indent=2) + "\n")
+
+
+def write_text(results: Results, name: str, text: str) -> None:
+    """Write a text whole or not at all; raises InputError if it cannot be written."""
+    with results.writing(name) as temporary:
+        Path(temporary).write_text(text, encoding="utf-8", errors="backslashreplace")
+
+
+def check_own(results: Results, place: object, splats: str) -> None:
+    """Raise InputError if a file would be replaced that is no result of a batch."""
+    if read_record(results) is not None:
+        return
+    for name in (splats, PICTURE, RECORD):
+        if results.exists(name):
+            raise InputError(
+                f"{place}: {name} exists, and idesplat batch did not write it; choose another --out, or add "
+                "--overwrite to replace it"
+            )

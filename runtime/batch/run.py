@@ -3,9 +3,10 @@
 import json
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +15,25 @@ from ..inference.model_files import read_model
 from ..inference.named_models import find_model
 from ..inference.providers import CPU, candidates
 from ..inference.session import DEFAULT, SessionConfig, usable_cores
-from ..splats.filtering import FilterOptions
-from ..system.files import atomic_write, make_folder
 from ..system.progress import progress
+from .cache import DEFAULT_GB, GB
+from .index import Index
+from .places import Place, join, parse_place
 from .pool import run_in_pool
-from .records import RECORD, SPLATS, Status, model_sha256, read_record
-from .scenes import FILTERS, OPTIONS, Scene, check_local, read_scenes
+from .ray_engine import run_on_ray
+from .records import PLY, Status, check_own, model_sha256, splats_name, write_text
+from .results import open_results
+from .scenes import Scenes, check_options, parse_shard, read_scenes
 from .worker import Outcome, Settings
 
-LOCAL = "local"
+MAX_LISTED = 1000  # failures in a summary
+
+
+class Engine(StrEnum):
+    """What runs the workers. LOCAL: processes of this machine. RAY: actors of Ray, here or on a cluster."""
+
+    LOCAL = "local"
+    RAY = "ray"
 
 
 @dataclass
@@ -31,7 +42,7 @@ class Summary:
 
     scenes: of this run, of its shard where it has one. done, failed: scenes in these states, from this run or earlier.
     tried: by this run. left: scenes that it did not get to, after `max_failures`. seconds: of the run.
-    failures: the error of each failed scene, by id.
+    failures: the error of each failed scene, by id; of the first thousand.
     """
 
     scenes: int
@@ -47,6 +58,11 @@ class Summary:
         pace = f"{60 * self.tried / max(self.seconds, 1e-9):.3g} scenes/min" if self.tried else ""
         return ", ".join(filter(None, (pace, f"{self.failed} failed" if self.failed else "")))
 
+    def describe(self) -> str:
+        """The counts, in words."""
+        left = f", {self.left} left" if self.left else ""
+        return f"{self.done} of {self.scenes} scenes done, {self.failed} failed{left}"
+
     def add(self, outcome: Outcome, seconds: float) -> None:
         """Count a scene."""
         record, self.seconds = outcome.record, seconds
@@ -55,123 +71,150 @@ class Summary:
             self.done += 1
         else:
             self.failed += 1
-            self.failures[record["id"]] = record["error"]
+            if len(self.failures) < MAX_LISTED:
+                self.failures[record["id"]] = record["error"]
 
 
 def batch(
     scenes: Path | str,
     out: Path | str,
     *,
-    engine: str = LOCAL,
+    engine: str = Engine.LOCAL,
+    address: str | None = None,
     model: Path | str | None = None,
     options: Mapping[str, Any] | None = None,
+    splat_format: str = PLY,
     workers: int = 1,
     provider: str = CPU,
     session: SessionConfig = DEFAULT,
     shard: str | None = None,
     retry_failed: bool = False,
     max_failures: int | None = None,
+    cache_gb: float = DEFAULT_GB,
     overwrite: bool = False,
     on_record: Callable[[dict[str, Any]], None] | None = None,
 ) -> Summary:
-    """Reconstruct the scenes that are missing or changed into `out/<id>/scene.ply`, in a pool of processes.
+    """Reconstruct the scenes that are missing or changed into `out/<id>/scene.ply`, in many processes.
 
     scenes: a folder of scene folders, or a .jsonl or .csv with the columns id, images, cameras and options, which go
     before `options`. A scene is done when `out/<id>/record.json`, which is written last, holds the hash of its images,
     cameras, options, model and version. A failed one is recorded, its traceback in `error.txt`, and the rest goes on;
     it is tried again when its inputs change or with `retry_failed`. The run stops after `max_failures` of its own.
-    engine: "local". model: as in `reconstruct`. options: keywords of `reconstruct` and fields of `FilterOptions`.
-    workers: processes, each with an opened model and its share of the cores unless `session` says how many threads.
+    `scenes`, `out` and what a table names are paths, or URLs of stores such as s3://bucket/scenes. Of inputs from
+    stores at most `cache_gb` are kept in the cache folder.
+    engine: "local" for a pool of processes, "ray" for actors of Ray, which starts here by itself unless `address` names
+    a cluster. model: as in `reconstruct`. options: keywords of `reconstruct` and fields of `FilterOptions`.
+    splat_format: "ply", "spz" or another suffix of splat files.
+    workers: processes, each with an opened model. session: its `threads` are those of each worker; by default its share
+    of the cores, or one on a cluster.
     shard: "I/N", the part I of N, from 1. overwrite: replace files in `out` that are no results of a batch.
     on_record: called with the record of each scene that was tried.
     Processes import the main module again: a script must call this under `if __name__ == "__main__":`.
     Raises InputError for invalid arguments, a model that cannot be opened, or a file that would be replaced.
     """
     started = time.perf_counter()
-    if engine != LOCAL:
-        raise InputError(f"engine {engine!r}: expected {LOCAL!r}")
-    if workers < 1:
-        raise InputError(f"--workers {workers}: expected 1 or more")
-    out = Path(out)
-    check_local(str(out))
-    chosen = choose_shard(read_scenes(Path(scenes)), shard)
-    _check_options(options or {})
+    target = parse_place(out)
+    source = parse_place(scenes)
+    if engine == Engine.RAY:  # its actors need not have this process's current folder
+        source, target = (place.absolute() if isinstance(place, Path) else place for place in (source, target))
+    chosen = read_scenes(source).of_shard(shard)
+    _check(engine, address, workers, cache_gb, options or {}, [chosen.source, target])
     candidates(provider)
-    _check_apart(Path(scenes), chosen, out)
-    if not overwrite:
-        _check_own(chosen, out)
-    files = read_model(find_model(model))
-    threads = session.threads or max(1, usable_cores() // workers)
+    splats = splats_name(splat_format)
+    if isinstance(target, Path):
+        _check_local(chosen, target, None if overwrite else splats)
+    files = read_model(find_model(model).absolute())
+    threads = session.threads or (1 if address else max(1, usable_cores() // workers))
     settings = Settings(
-        *(files, model_sha256(files), provider, replace(session, threads=threads), dict(options or {}), retry_failed)
+        files,
+        model_sha256(files),
+        provider,
+        replace(session, threads=threads),
+        dict(options or {}),
+        target,
+        splat_format,
+        retry_failed,
+        overwrite,
+        int(cache_gb * GB),
     )
-    summary = Summary(len(chosen))
+    summary, index = Summary(len(chosen)), Index()
     failures = 0
-    with closing(run_in_pool(chosen, out, min(workers, max(len(chosen), 1)), threads, settings)) as outcomes:
+    workers = min(workers, max(len(chosen), 1))
+    with closing(_run(Engine(engine), chosen, workers, threads, settings, address)) as outcomes:
         for outcome in progress(outcomes, "reconstructing scenes", len(chosen), summary.describe_pace):
             summary.add(outcome, time.perf_counter() - started)
+            index.add(outcome.record)
             if outcome.tried and on_record is not None:
                 on_record(outcome.record)
             failures += outcome.tried and outcome.record["status"] == Status.FAILED
             if max_failures is not None and failures >= max_failures:
                 break
     summary.left = summary.scenes - summary.done - summary.failed
-    make_folder(out)
-    with atomic_write(summary_path(out, shard)) as temporary:
-        temporary.write_text(json.dumps(asdict(summary), indent=2) + "\n", encoding="utf-8")
+    results = open_results(target)
+    write_text(results, summary_name(shard), json.dumps(asdict(summary), indent=2) + "\n")
+    write_text(results, index_name(shard), index.page(summary.describe()))
     return summary
 
 
-def choose_shard(scenes: Sequence[Scene], shard: str | None) -> list[Scene]:
-    """Every N-th scene from the I-th on, for a shard "I/N"; raises InputError."""
-    if shard is None:
-        return list(scenes)
-    number, count = parse_shard(shard)
-    return list(scenes[number - 1 :: count])
+def summary_name(shard: str | None) -> str:
+    """The name of the summary of a run, or of one shard."""
+    return f"summary{_part(shard)}.json"
 
 
-def parse_shard(shard: str) -> tuple[int, int]:
-    """The numbers of a shard "I/N"; raises InputError unless I is from 1 to N."""
-    parts = shard.split("/")
-    if len(parts) != 2 or not all(part.isascii() and part.isdigit() and len(part) < 10 for part in parts):
-        raise InputError(f"--shard {shard[:40]}: expected I/N, such as 1/8")
-    number, count = map(int, parts)
-    if not 1 <= number <= count:
-        raise InputError(f"--shard {shard}: expected a number from 1 to {count}, and how many there are")
-    return number, count
+def index_name(shard: str | None) -> str:
+    """The name of the page that shows a run's scenes, or those of one shard."""
+    return f"index{_part(shard)}.html"
 
 
-def summary_path(out: Path, shard: str | None) -> Path:
-    """Where the summary of a run, or of one shard, is written."""
-    return out / ("summary-{}-of-{}.json".format(*parse_shard(shard)) if shard else "summary.json")
+def _part(shard: str | None) -> str:
+    return "-{}-of-{}".format(*parse_shard(shard)) if shard else ""
 
 
-def _check_options(options: Mapping[str, Any]) -> None:
-    unknown = sorted(set(options) - set(OPTIONS))
-    if unknown:
-        raise InputError(f"unknown option {unknown[0]!r}; expected {', '.join(OPTIONS)}")
-    FilterOptions(**{name: options[name] for name in FILTERS if name in options})
+def _run(
+    engine: Engine, scenes: Scenes, workers: int, threads: int, settings: Settings, address: str | None
+) -> Generator[Outcome, None, None]:
+    if engine is Engine.RAY:
+        return run_on_ray(scenes, workers, threads, settings, address)
+    return run_in_pool(scenes, workers, threads, settings)
 
 
-def _check_apart(source: Path, scenes: Sequence[Scene], out: Path) -> None:
-    """Raise InputError where results would stand among the images."""
+def _check(
+    engine: str, address: str | None, workers: int, cache_gb: float, options: Mapping[str, Any], places: list[Place]
+) -> None:
+    """Raise InputError for invalid arguments."""
+    if engine not in tuple(Engine):
+        raise InputError(f"--engine {engine}: expected {' or '.join(Engine)}")
+    if address is not None and engine != Engine.RAY:
+        raise InputError(f"--address {address}: is of a Ray cluster; add --engine ray")
+    if workers < 1:
+        raise InputError(f"--workers {workers}: expected 1 or more")
+    if not 0 <= cache_gb < float("inf"):
+        raise InputError(f"--cache-size {cache_gb}: expected a number of gigabytes")
+    check_options(options)
+    for place in places:
+        if isinstance(place, str) and place.startswith("memory:"):
+            raise InputError(f"{place}: lives in one process, and a batch has several; use SceneReconstructor")
+
+
+def _check_local(scenes: Scenes, out: Path, splats: str | None) -> None:
+    """Raise InputError where results would stand among the images, or would replace files that no batch wrote.
+
+    splats: the name of the splat files; None where anything may be replaced.
+    """
     real = os.path.realpath(out)
-    folders = [source] if source.is_dir() else [scene.images for scene in scenes]
-    for folder in folders:
-        if Path(real).is_relative_to(os.path.realpath(folder)):
-            raise InputError(f"--out {out}: lies in {folder}, which is an input; choose a folder elsewhere")
+    if isinstance(scenes.source, Path) and scenes.source.is_dir():
+        _check_outside(out, real, scenes.source)
     for scene in scenes:
-        if Path(os.path.realpath(scene.images)).is_relative_to(os.path.join(real, scene.id)):
-            raise InputError(f"--out {out}: the results of {scene.id} would stand beside its images; choose another")
-
-
-def _check_own(scenes: Sequence[Scene], out: Path) -> None:
-    """Raise InputError if a file would be replaced that is no result of a batch."""
-    for scene in scenes:
-        folder = out / scene.id
-        for name in (SPLATS, RECORD):
-            if os.path.lexists(folder / name) and read_record(folder) is None:
+        if isinstance(scene.images, Path):
+            _check_outside(out, real, scene.images)
+            if Path(os.path.realpath(scene.images)).is_relative_to(os.path.join(real, scene.id)):
                 raise InputError(
-                    f"{folder / name}: exists, and idesplat batch did not write it; choose another --out, or add "
-                    "--overwrite to replace it"
+                    f"--out {out}: the results of {scene.id} would stand beside its images; choose another"
                 )
+        if splats is not None:
+            check_own(open_results(join(out, scene.id)), out / scene.id, splats)
+
+
+def _check_outside(out: Path, real: str, folder: Path) -> None:
+    if Path(real).is_relative_to(os.path.realpath(folder)):
+        raise InputError(f"--out {out}: lies in {folder}, which is an input; choose a folder elsewhere")

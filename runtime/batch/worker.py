@@ -1,5 +1,6 @@
-"""What a worker does with a scene. It opens the model when the first scene needs it, and keeps it open."""
+"""What one process does with scenes. It opens the model when the first scene needs it, and keeps it open."""
 
+import logging
 import time
 import traceback
 from collections.abc import Mapping
@@ -9,6 +10,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
+
 from ..errors import InputError
 from ..inference.model_files import ModelFiles
 from ..inference.predictor import Predictor
@@ -16,21 +19,54 @@ from ..inference.providers import candidates
 from ..inference.session import SessionConfig
 from ..reconstruction.pipeline import reconstruct
 from ..splats.filtering import FilterOptions
-from ..system.files import atomic_write, make_folder
-from .records import SPLATS, TRACEBACK, Status, file_sha256, fingerprint, is_done, read_record, write_record
+from ..system.memory import peak_bytes, reset_peak
+from ..system.outputs import outputs
+from ..system.threads import limit_threads
+from .cache import DEFAULT_GB, GB, InputCache
+from .inputs import open_inputs
+from .measures import measure, save_picture
+from .places import Place, join
+from .records import (
+    PICTURE,
+    PLY,
+    RECORD,
+    TRACEBACK,
+    Status,
+    check_own,
+    files_of,
+    fingerprint,
+    is_done,
+    read_record,
+    splats_name,
+    write_record,
+    write_text,
+)
+from .results import Results, open_results
 from .scenes import FILTERS, Scene
+
+LOG = logging.getLogger(__name__)
+
+KILLED = "its worker process was killed twice, out of memory perhaps; use fewer workers, or fewer or smaller images"
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What all scenes of a run have in common. model_sha256: of `records.model_sha256`."""
+    """What all scenes of a run have in common.
+
+    model_sha256: of `records.model_sha256`. out: the folder or URL that holds a folder of results for each scene.
+    splat_format: a suffix without the dot. cache_bytes: of downloaded inputs to keep.
+    """
 
     model: ModelFiles
     model_sha256: str
     provider: str
     session: SessionConfig
     options: Mapping[str, Any]
+    out: Place
+    splat_format: str = PLY
     retry_failed: bool = False
+    overwrite: bool = False
+    cache_bytes: int = int(DEFAULT_GB * GB)
 
 
 class Outcome(NamedTuple):
@@ -40,6 +76,28 @@ class Outcome(NamedTuple):
     tried: bool
 
 
+def start_worker(settings: Settings, threads: int) -> "Worker":
+    """Prepare this process for a worker that takes so many threads."""
+    limit_threads(threads)
+    cv2.setNumThreads(threads)
+    return Worker(settings)
+
+
+def record_killed(scene: Scene, settings: Settings) -> Outcome:
+    """The failure of a scene whose worker was killed twice; written down where the disk or the store takes it."""
+    place = join(settings.out, scene.id)
+    record = {"id": scene.id, "status": Status.FAILED, "error": KILLED, "hash": None, "seconds": None}
+    try:
+        results = open_results(place)
+        record["hash"] = (read_record(results) or {}).get("hash")
+        if isinstance(place, Path):
+            outputs().writes("", [place / RECORD], known=True)
+        write_record(results, record)
+    except InputError as error:
+        LOG.warning("%s", error)
+    return Outcome(record, True)
+
+
 @dataclass
 class Worker:
     """Reconstructs scenes one after the other with one opened model."""
@@ -47,41 +105,50 @@ class Worker:
     settings: Settings
     _predictor: Predictor | None = field(default=None, init=False)
 
-    def run(self, scene: Scene, folder: Path) -> Outcome:
-        """Reconstruct a scene into its folder, unless the record there says that it is done or has failed.
+    def run(self, scene: Scene) -> Outcome:
+        """Reconstruct a scene into its results, unless the record there says that it is done or has failed.
 
-        A failure is returned as a record, and is written down where the disk takes it.
+        A failure is returned as a record, and is written down where the disk or the store takes it.
         Raises InputError if the model cannot be opened.
         """
         started = time.perf_counter()
         made_from: str | None = None
-        before = read_record(folder) or {}
+        before: dict[str, Any] = {}
+        reset_peak()
         try:
-            made_from = self._fingerprint(scene)
-            if is_done(folder, before, made_from) or self._stays_failed(before, made_from):
+            results = open_results(join(self.settings.out, scene.id))
+            results.tidy()
+            before = read_record(results) or {}
+            inputs = open_inputs(scene, InputCache(self.settings.cache_bytes))
+            made_from = self._fingerprint(scene, inputs.hashes())
+            if is_done(results, before, made_from) or self._stays_failed(before, made_from):
                 return Outcome(before, False)
+            if not self.settings.overwrite:
+                check_own(results, join(self.settings.out, scene.id), splats_name(self.settings.splat_format))
         except Exception as error:
             if self._stays_failed(before, made_from):
                 return Outcome(before, False)
-            return Outcome(self._fail(scene, folder, made_from, error, started), True)
+            return Outcome(self._fail(scene, made_from, error, started), True)
         predictor = self._open()
         try:
-            make_folder(folder)
             # No record of other splats may stand beside new ones, and a killed worker leaves what it worked on.
-            write_record(folder, {"id": scene.id, "hash": made_from, "status": Status.STARTED})
-            (folder / SPLATS).unlink(missing_ok=True)
-            record = self._reconstruct(scene, folder, predictor)
-            record |= {"hash": made_from, "seconds": time.perf_counter() - started}
-            (folder / TRACEBACK).unlink(missing_ok=True)
-            write_record(folder, record)
+            write_record(results, {"id": scene.id, "hash": made_from, "status": Status.STARTED})
+            for name in {*files_of(before), splats_name(self.settings.splat_format)}:
+                results.remove(name)
+            with inputs.local() as local:
+                record = self._reconstruct(local, results, predictor)
+            results.remove(TRACEBACK)
+            record |= {"hash": made_from, "seconds": time.perf_counter() - started, "peak_memory": peak_bytes()}
+            write_record(results, record)
         except Exception as error:  # one scene's failure must not end the others
-            record = self._fail(scene, folder, made_from, error, started)
+            record = self._fail(scene, made_from, error, started)
         return Outcome(record, True)
 
-    def _fingerprint(self, scene: Scene) -> str:
-        options = {**self.settings.options, **scene.options}
-        providers = ",".join(provider.name for provider in candidates(self.settings.provider))
-        return fingerprint(scene, options, self.settings.model_sha256, providers)
+    def _fingerprint(self, scene: Scene, inputs: Any) -> str:
+        settings = self.settings
+        options = {**settings.options, **scene.options}
+        providers = ",".join(provider.name for provider in candidates(settings.provider))
+        return fingerprint(scene, inputs, options, settings.model_sha256, providers, settings.splat_format)
 
     def _stays_failed(self, before: Mapping[str, Any], made_from: str | None) -> bool:
         failed = before.get("status") == Status.FAILED and before.get("hash") == made_from
@@ -92,35 +159,42 @@ class Worker:
             self._predictor = Predictor(self.settings.model, self.settings.provider, self.settings.session)
         return self._predictor
 
-    def _reconstruct(self, scene: Scene, folder: Path, predictor: Predictor) -> dict[str, Any]:
-        """Write the splats; the record of them."""
+    def _reconstruct(self, scene: Scene, results: Results, predictor: Predictor) -> dict[str, Any]:
+        """Write the splats and the picture; the record of them."""
         options = {**self.settings.options, **scene.options}
         filters = FilterOptions(**{name: options.pop(name) for name in FILTERS if name in options})
         result = reconstruct(scene.images, scene.cameras, model=predictor, filters=filters, **options)
-        lost = result.save(folder / SPLATS)
+        finished = time.perf_counter()
+        splats = splats_name(self.settings.splat_format)
+        with results.writing(splats) as temporary:
+            lost = result.save(temporary)
+        written = time.perf_counter()
+        psnr, picture = measure(result)
+        with results.writing(PICTURE) as temporary:
+            save_picture(temporary, picture)
+        measured = time.perf_counter()
         return {
             "id": scene.id,
             "status": Status.DONE,
             "version": version("idesplat"),
-            "sha256": file_sha256(folder / SPLATS),
+            "files": {name: results.describe(name) for name in (splats, PICTURE)},
             "gaussians": 0 if result.gaussians is None else len(result.gaussians),
             "views": result.views.names,
+            "psnr": psnr,
             "notes": [*result.notes, *lost],
-            "timings": result.timings,
+            "timings": {**result.timings, "write": written - finished, "measure": measured - written},
         }
 
-    def _fail(
-        self, scene: Scene, folder: Path, made_from: str | None, error: Exception, started: float
-    ) -> dict[str, Any]:
+    def _fail(self, scene: Scene, made_from: str | None, error: Exception, started: float) -> dict[str, Any]:
         """The record of a failure; written, but for a disk that is full or the like, and then the scene is not done."""
         line = " ".join(str(error).split()) or type(error).__name__
         line = line if isinstance(error, InputError) else f"{type(error).__name__}: {line}"
         seconds = time.perf_counter() - started
         record = {"id": scene.id, "status": Status.FAILED, "error": line, "hash": made_from, "seconds": seconds}
         with suppress(InputError, OSError):
-            make_folder(folder)
-            with atomic_write(folder / TRACEBACK) as temporary:
-                text = "".join(traceback.format_exception(error))
-                temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
-            write_record(folder, record)
+            results = open_results(join(self.settings.out, scene.id))
+            if not self.settings.overwrite:
+                check_own(results, scene.id, splats_name(self.settings.splat_format))
+            write_text(results, TRACEBACK, "".join(traceback.format_exception(error)))
+            write_record(results, record)
         return record

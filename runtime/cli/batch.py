@@ -52,17 +52,41 @@ MAX_WORKERS = 1024
 def batch(
     *,
     scenes: Annotated[
-        Path,
+        str,
         typer.Argument(
             help="Folder of scene folders; or .jsonl or .csv with the columns id, images, cameras, and options of "
-            "this command by their names, which go before the command line."
+            "this command by their names, which go before the command line. A path, or the URL of a store."
         ),
     ],
     out: Annotated[
-        Path, typer.Option("--out", "-o", help="Folder for <id>/scene.ply, <id>/record.json and summary.json.")
+        str,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Folder for <id>/scene.ply, <id>/record.json, summary.json and index.html. A path, or a URL such as "
+            "s3://bucket/results.",
+        ),
     ],
     model: Model = None,
-    engine: Annotated[str, typer.Option(help="`local`: processes on this machine.", metavar="local")] = "local",
+    splat_format: Annotated[
+        str,
+        typer.Option(
+            "--format",
+            help="Format of the splat files, by their suffix.",
+            metavar="ply|compressed.ply|splat|spz|sog|glb",
+        ),
+    ] = "ply",
+    engine: Annotated[
+        str,
+        typer.Option(help="local: processes on this machine. ray: actors of Ray.", metavar="local|ray"),
+    ] = "local",
+    address: Annotated[
+        str | None,
+        typer.Option(
+            help="With --engine ray: the cluster, or `auto` for the one of this machine; else Ray starts by itself.",
+            metavar="auto|HOST:PORT",
+        ),
+    ] = None,
     workers: Annotated[
         int,
         typer.Option(help="Processes, each with an opened model and its share of cores.", min=1, max=MAX_WORKERS),
@@ -75,6 +99,10 @@ def batch(
     max_failures: Annotated[
         int | None, typer.Option(help="Stop after so many failures.", min=1, show_default=False)
     ] = None,
+    cache_size: Annotated[
+        float,
+        typer.Option(help="Of inputs from stores, keep at most so many gigabytes in the cache folder.", min=0),
+    ] = 10.0,
     camera_format: CamerasFormat = None,
     focal: Focal = None,
     quality: QualityOption = None,
@@ -108,8 +136,9 @@ def batch(
 
     Prints one line of JSON for each scene, or, on a terminal, progress. The exit status is 3 where some failed.
     """
+    from ..batch.places import join, parse_place
     from ..batch.run import batch as run_batch
-    from ..batch.run import summary_path
+    from ..batch.run import index_name, summary_name
     from ..images.sizes import parse_size
     from ..inference.inputs import parse_views
     from ..system.outputs import outputs
@@ -137,13 +166,19 @@ def batch(
         "merge_duplicates": merge_duplicates,
         "close_holes": close_holes,
     }
-    written = summary_path(out, shard)
-    outputs().writes("--out", [written], known=_is_summary(written))
+    on_terminal = sys.stdout.isatty()  # asked before there is progress, which takes the stream
+    target = parse_place(out)
+    summary_place, page = join(target, summary_name(shard)), join(target, index_name(shard))
+    if isinstance(summary_place, Path) and isinstance(page, Path):
+        known = _is_summary(summary_place)
+        outputs().writes("--out", [summary_place, page], known=known)
     summary = run_batch(
         scenes,
         out,
         engine=engine,
+        address=address,
         model=model,
+        splat_format=splat_format,
         options={name: value for name, value in options.items() if value},
         workers=workers,
         provider=provider,
@@ -151,14 +186,14 @@ def batch(
         shard=shard,
         retry_failed=retry_failed,
         max_failures=max_failures,
+        cache_gb=cache_size,
         overwrite=overwrite,
-        on_record=_tell,
+        on_record=_tell_failure if on_terminal else _tell_line,
     )
-    if sys.stdout.isatty():
-        left = f", {summary.left} left" if summary.left else ""
+    if on_terminal:
         pace = f" in {summary.seconds:.1f} s, {60 * summary.tried / summary.seconds:.3g} scenes/min"
-        note(f"{summary.tried} of {summary.scenes} scenes tried{pace if summary.tried else ''}{left}")
-        note(f"{summary.done} done, {summary.failed} failed: {written}; `idesplat view {out}/ID/scene.ply` shows one")
+        note(f"{summary.tried} tried{pace if summary.tried else ''}; {summary.describe()}: {summary_place}")
+        note(f"open {page} in any browser; `idesplat view {out}/ID/scene.{splat_format}` shows a scene")
     if summary.failed:
         raise typer.Exit(SOME_FAILED)
 
@@ -168,11 +203,14 @@ def main() -> None:
     run(batch)
 
 
-def _tell(record: dict[str, Any]) -> None:
-    """One line of JSON for a scene, or on a terminal, where there is progress, only for a failure."""
-    if not sys.stdout.isatty():
-        say(json.dumps(record))
-    elif "error" in record:
+def _tell_line(record: dict[str, Any]) -> None:
+    """One line of JSON for a scene."""
+    say(json.dumps(record))
+
+
+def _tell_failure(record: dict[str, Any]) -> None:
+    """On a terminal, where there is progress, only the error of a failure."""
+    if "error" in record:
         warn(f"{record['id']}: {record['error']}")
 
 

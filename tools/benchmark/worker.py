@@ -3,7 +3,6 @@
 import json
 import multiprocessing
 import signal
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from ...runtime.system.memory import peak_bytes
 from ..processes import safe_path
 
 if TYPE_CHECKING:
@@ -115,20 +115,6 @@ def _serve(pipe: Connection, prepare: Callable[..., Prepared], arguments: tuple)
         pass
     except Exception as error:
         pipe.send(Failed(" ".join(str(error).split()) or type(error).__name__))
-
-
-def peak_bytes() -> int | None:
-    """Peak resident memory of this process in bytes."""
-    try:  # getrusage would include the parent's, of which this process was a fork
-        status = Path("/proc/self/status").read_text()
-        return int(status.partition("VmHWM:")[2].split()[0]) * 1024
-    except (OSError, IndexError):
-        pass
-    if sys.platform == "darwin":
-        import resource
-
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return None
 
 
 # ---- candidates: what `about` holds, and what is run

@@ -3,8 +3,7 @@
 import json
 
 import pytest
-from idesplat.runtime.batch.run import choose_shard
-from idesplat.runtime.batch.scenes import Scene, read_scenes
+from idesplat.runtime.batch.scenes import read_scenes
 from idesplat.runtime.errors import InputError
 
 
@@ -16,7 +15,8 @@ from idesplat.runtime.errors import InputError
         ({"id": "summary.json", "images": "x"}, "none in .json"),
         ({"id": "é" * 101, "images": "x"}, "200 bytes at most"),
         ({"id": "a"}, "expected both"),
-        ({"id": "a", "images": "s3://bucket/a"}, "is a URL, expected a local path"),
+        ({"id": "a", "images": "ftp://host/a"}, "expected a local path, or a URL that begins with s3://"),
+        ({"id": "a", "images": "s3:/bucket/a"}, "expected a local path, or a URL that begins with s3://"),
         ({"id": "a", "images": "\0"}, "no file can have this name"),
         ({"id": "a", "images": "x", "sise": 3}, "unknown column 'sise'"),
         ({"id": "a", "images": "x", "near": "close"}, "near 'close': expected a number"),
@@ -35,7 +35,7 @@ def test_a_bad_row_is_named(tmp_path, row, said):
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
-        ("a.jsonl", "", "is empty"),
+        ("a.jsonl", "", "no scene in it"),
         ("a.jsonl", "\n", "no scene in it"),
         ("a.jsonl", "{", "cannot be read"),
         ("a.jsonl", "[" * 100_000, "cannot be read"),
@@ -63,10 +63,13 @@ def test_a_table_gives_paths_beside_it_and_options(tmp_path):
 
 
 def test_shards_share_the_scenes_out(tmp_path):
-    scenes = [Scene(str(number), tmp_path) for number in range(7)]
-    shards = [choose_shard(scenes, f"{number}/3") for number in (1, 2, 3)]
-    assert sorted((scene.id for shard in shards for scene in shard), key=int) == [scene.id for scene in scenes]
+    for number in range(7):
+        (tmp_path / f"{number}").mkdir()
+    scenes = read_scenes(tmp_path)
+    shards = [scenes.of_shard(f"{number}/3") for number in (1, 2, 3)]
+    assert sorted(scene.id for shard in shards for scene in shard) == [scene.id for scene in scenes]
+    assert [len(shard) for shard in shards] == [len(list(shard)) for shard in shards]
     assert max(map(len, shards)) - min(map(len, shards)) <= 1
     for wrong in ("0/3", "4/3", "1", "1/", "a/b", "1/0", "-1/2", "²/3"):
         with pytest.raises(InputError, match="--shard"):
-            choose_shard(scenes, wrong)
+            scenes.of_shard(wrong)

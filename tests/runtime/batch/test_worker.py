@@ -4,7 +4,9 @@ import json
 import shutil
 
 import pytest
+from idesplat.runtime.batch.inputs import LocalInputs
 from idesplat.runtime.batch.records import fingerprint, model_sha256, read_record
+from idesplat.runtime.batch.results import LocalResults
 from idesplat.runtime.batch.run import batch
 from idesplat.runtime.batch.scenes import Scene
 from idesplat.runtime.batch.worker import Settings, Worker
@@ -18,7 +20,7 @@ from tiny_model import NETWORK, write_model
 @pytest.fixture
 def worker(tmp_path):
     model = read_model(write_model(tmp_path / "tiny.onnx"))
-    return Worker(Settings(model, model_sha256(model), "CPU", DEFAULT, {}))
+    return Worker(Settings(model, model_sha256(model), "CPU", DEFAULT, {}, tmp_path / "out"))
 
 
 @pytest.fixture
@@ -28,20 +30,20 @@ def own(scene, tmp_path):
 
 
 def test_a_scene_is_done_once(worker, own, tmp_path):
-    record, tried = worker.run(own, tmp_path / "out")
+    record, tried = worker.run(own)
     assert tried
     assert record["status"] == "done"
-    assert record == read_record(tmp_path / "out")
-    assert worker.run(own, tmp_path / "out") == (record, False)
+    assert record == read_record(LocalResults(tmp_path / "out" / "a"))
+    assert worker.run(own) == (record, False)
     changed = Scene("a", own.images, options={"views": 3})
-    again, tried = worker.run(changed, tmp_path / "out")
+    again, tried = worker.run(changed)
     assert tried
     assert (len(record["views"]), len(again["views"])) == (2, 3)
 
 
 def test_a_failure_that_cannot_be_written_is_returned(worker, own, tmp_path):
     (tmp_path / "out").write_text("a file where a folder is needed, as a disk that is full")
-    record, tried = worker.run(own, tmp_path / "out")
+    record, tried = worker.run(own)
     assert tried
     assert record["status"] == "failed"
     assert "cannot create the folder" in record["error"]
@@ -52,19 +54,20 @@ def test_a_failure_stands_until_the_inputs_change(worker, own, tmp_path):
     good = cameras.read_text()
     cameras.write_text(json.dumps({**json.loads(good), "frames": []}))
     failing = Scene("a", own.images / "images", cameras)
-    record, tried = worker.run(failing, tmp_path / "out")
+    record, tried = worker.run(failing)
     assert tried
     assert record["status"] == "failed"
-    assert "Traceback" in (tmp_path / "out" / "error.txt").read_text()
-    assert worker.run(failing, tmp_path / "out") == (record, False)
+    assert "Traceback" in (tmp_path / "out" / "a" / "error.txt").read_text()
+    assert worker.run(failing) == (record, False)
     cameras.write_text(good)
-    assert worker.run(failing, tmp_path / "out").record["status"] == "done"
-    assert not (tmp_path / "out" / "error.txt").exists()
+    assert worker.run(failing).record["status"] == "done"
+    assert not (tmp_path / "out" / "a" / "error.txt").exists()
 
 
 def test_the_hash_changes_with_what_the_splats_are_made_from(own):
-    def made_from(options=None, model="m", provider="CPU", images=own.images, cameras=None):
-        return fingerprint(Scene("a", images, cameras), options or {}, model, provider)
+    def made_from(options=None, model="m", provider="CPU", splats="ply", images=own.images, cameras=None):
+        scene = Scene("a", images, cameras)
+        return fingerprint(scene, LocalInputs(scene).hashes(), options or {}, model, provider, splats)
 
     before = made_from()
     (own.images / "notes.txt").write_text("not read")
@@ -73,6 +76,7 @@ def test_the_hash_changes_with_what_the_splats_are_made_from(own):
         made_from({"near": 1.0}),
         made_from(model="n"),
         made_from(provider="CUDA"),
+        made_from(splats="spz"),
         made_from(images=own.images / "images", cameras="estimate"),
     ]
     with (own.images / "transforms.json").open("a") as file:
@@ -105,8 +109,8 @@ def test_nothing_of_others_is_replaced_and_nothing_stands_among_inputs(own, tmp_
             batch(scenes, target, model=tmp_path / "tiny.onnx")
     with pytest.raises(InputError, match="unknown option 'nears'"):
         batch(scenes, tmp_path / "new", options={"nears": 1})
-    with pytest.raises(InputError, match="engine 'ray': expected 'local'"):
-        batch(scenes, tmp_path / "new", engine="ray")
+    with pytest.raises(InputError, match="--engine dask: expected local or ray"):
+        batch(scenes, tmp_path / "new", engine="dask")
     assert not (tmp_path / "new").exists()
     assert (out / "a" / "scene.ply").read_text() == "the user's own"
 
