@@ -24,7 +24,7 @@ ENTRYPOINT ["idesplat", "serve", "--host", "0.0.0.0", "--port", "8000"]
 CMD ["--workers", "1"]
 
 FROM base AS command
-RUN pip install --no-cache-dir "/src[colmap,spz]" && rm -rf /src/build
+RUN pip install --no-cache-dir "/src[colmap,ray,remote,spz]" && rm -rf /src/build
 USER 65534:65534
 WORKDIR /data
 HEALTHCHECK NONE
