@@ -4,11 +4,13 @@ import os
 import pickle
 import random
 import zipfile
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import pytest
 import torch
-from conftest import SMALL, small_network
+from conftest import SMALL
 from idesplat.model.checkpoint import (
     CheckpointError,
     file_sha256,
@@ -19,11 +21,24 @@ from idesplat.model.checkpoint import (
     read_state_dict,
 )
 from idesplat.model.idesplat.keys import RENAMING, rename_released
+from idesplat.model.idesplat.network import IDESplat
 from idesplat.model.registry import PRESETS
 from reference_weights import random_state_dict
 from safetensors.torch import save_file
 
 CASE = "idesplat-re10k-2v-256x256"
+# With as few tensors as it can have: these tests read and write them all, and run nothing.
+FEW = replace(
+    SMALL,
+    transformer_layers=1,
+    dpbus=tuple(replace(dpbu, unet=replace(dpbu.unet, levels=1)) for dpbu in SMALL.dpbus),
+    residual_unet=replace(SMALL.residual_unet, levels=1),
+)
+
+
+@cache
+def weights() -> dict[str, torch.Tensor]:
+    return IDESplat(FEW).state_dict()
 
 
 @pytest.fixture(scope="module")
@@ -34,17 +49,17 @@ def released():
 
 @pytest.mark.parametrize("nest", (lambda d: d, lambda d: {"state_dict": d, "epoch": 3}, lambda d: {"model": d}))
 def test_containers(tmp_path, nest):
-    tensors = small_network().state_dict()
+    tensors = weights()
     path = tmp_path / "weights.ckpt"
     torch.save(nest(tensors), path)
-    loaded = load_checkpoint(path, SMALL).state_dict()
+    loaded = load_checkpoint(path, FEW).state_dict()
     assert all(torch.equal(loaded[key], value) for key, value in tensors.items())
 
 
 def test_safetensors(tmp_path):
     path = tmp_path / "weights.safetensors"
-    save_file(small_network().state_dict(), path)
-    assert load_checkpoint(path, SMALL)
+    save_file(weights(), path)
+    assert load_checkpoint(path, FEW)
 
 
 def test_released_files_lose_their_prefix_and_what_belongs_to_the_loss(tmp_path):
@@ -73,7 +88,7 @@ def test_names_are_mapped_one_to_one(released):
 
 
 def test_a_missing_an_unknown_and_a_misshapen_tensor_are_named():
-    model = small_network()
+    model = IDESplat(FEW)
     tensors = model.state_dict()
     del tensors["encoder.backbone.conv1.weight"]
     tensors["encoder.new.weight"] = torch.zeros(1)
@@ -92,7 +107,7 @@ def test_a_missing_an_unknown_and_a_misshapen_tensor_are_named():
 
 
 def test_a_transposed_tensor_is_refused():
-    model = small_network()
+    model = IDESplat(FEW)
     tensors = {k: v.T if k == "encoder.transformer.layers.0.mlp1.weight" else v for k, v in model.state_dict().items()}
     with pytest.raises(CheckpointError, match=r"mlp1\.weight has shape"):
         fill(model, tensors, Path("file.pth"))
@@ -139,7 +154,7 @@ def test_a_missing_file_and_a_file_without_tensors(tmp_path):
 
 def _replaced(value):
     """The small network's state dict with one tensor replaced."""
-    return {**small_network().state_dict(), "dpbu1.merge.conv.bias": value}
+    return {**weights(), "dpbu1.merge.conv.bias": value}
 
 
 ODD_CONTENTS = {
@@ -148,7 +163,7 @@ ODD_CONTENTS = {
     "a key of bytes among text": (lambda: {"a": torch.zeros(2), b"b": torch.zeros(2)}, "key of type bytes"),
     "an empty key": (lambda: {"": torch.zeros(2)}, "does not fit"),
     "a key of many lines": (
-        lambda: {**small_network().state_dict(), "a\nb\x1b[2J\udcff": torch.zeros(2)},
+        lambda: {**weights(), "a\nb\x1b[2J\udcff": torch.zeros(2)},
         r"'a\nb\x1b[2J\udcff' is unknown",
     ),
     "sparse": (lambda: _replaced(torch.eye(64).to_sparse()), "is sparse"),
@@ -175,7 +190,7 @@ def test_odd_contents_are_refused_in_one_line(tmp_path, name, legacy, recwarn):
     torch.save(make(), path, _use_new_zipfile_serialization=not legacy)
     recwarn.clear()
     with pytest.raises(CheckpointError) as error:
-        load_checkpoint(path, SMALL)
+        load_checkpoint(path, FEW)
     message = str(error.value)
     assert expected in message and "odd.pth" in message
     assert message.isprintable() and len(message) < 800
@@ -183,18 +198,18 @@ def test_odd_contents_are_refused_in_one_line(tmp_path, name, legacy, recwarn):
 
 
 def test_half_precision_is_taken(tmp_path):
-    tensors = {key: value.half() for key, value in small_network().state_dict().items()}
+    tensors = {key: value.half() for key, value in weights().items()}
     torch.save(tensors, tmp_path / "half.pth")
-    assert next(load_checkpoint(tmp_path / "half.pth", SMALL).parameters()).dtype == torch.float32
+    assert next(load_checkpoint(tmp_path / "half.pth", FEW).parameters()).dtype == torch.float32
 
 
 def test_a_tensor_with_attributes_of_its_own_is_used_as_a_tensor(tmp_path):
     """A file may give a parameter any attribute, also one that hides a method of tensors."""
-    tensors = small_network().state_dict()
+    tensors = weights()
     weight = torch.nn.Parameter(tensors["dpbu1.merge.conv.bias"])
     weight.reshape = weight.isfinite = weight.squeeze = "text"
     torch.save({**tensors, "dpbu1.merge.conv.bias": weight}, tmp_path / "odd.pth")
-    assert load_checkpoint(tmp_path / "odd.pth", SMALL)
+    assert load_checkpoint(tmp_path / "odd.pth", FEW)
 
 
 @pytest.mark.parametrize("legacy", (False, True))
