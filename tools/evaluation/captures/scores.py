@@ -105,9 +105,21 @@ class CaptureEvaluator:
             result.cases[count] = [self._window(case, pairs, show)]
         return result
 
+    def predict(self, case: EvalCase) -> tuple[Gaussians, float]:
+        """The Gaussians as `reconstruct` makes them of these views, and the seconds that it takes."""
+        views, span = _view_batch(case.context), DepthRange(case.near, case.far, "given")
+        started = time.perf_counter()
+        with reporting_to(None):
+            views, _ = compensate_exposure(views, ExposureMode.AUTO)
+            prediction = predict_views(self.predictor, views, span)
+            prediction = fuse(prediction, views, span, self.plan.filters).prediction
+            if self.plan.copy_side:
+                prediction = refine_prediction(prediction, views, self.plan, None).prediction
+        return prediction.need_gaussians(), time.perf_counter() - started
+
     def _triple(self, case: EvalCase, show: Show | None) -> CaseScores:
         """Evaluate a pair of views and one held-out frame, with the baselines."""
-        gaussians, seconds = self._predict(case)
+        gaussians, seconds = self.predict(case)
         pose, K = case.targets.extrinsics[0], case.targets.K(0)
         truth, valid = case.targets.image(0), case.targets.valid[0]
         plane, _ = best_fronto_parallel_plane(case.context, truth, valid, pose, K, case.near, case.far)
@@ -126,7 +138,7 @@ class CaptureEvaluator:
 
     def _window(self, case: EvalCase, pairs: dict[str, Scores], show: Show | None) -> CaseScores:
         """Evaluate several views and the held-out frames between them; pairs: each frame's scores from two views."""
-        gaussians, seconds = self._predict(case)
+        gaussians, seconds = self.predict(case)
         targets = []
         for index, name in enumerate(case.targets.names):
             truth, valid = case.targets.image(index), case.targets.valid[index]
@@ -137,18 +149,6 @@ class CaptureEvaluator:
             if show is not None:
                 show(_strip_name(case, index), comparison_strip(truth, valid, rendering, None))
         return CaseScores(case.context.names, targets, _input_psnr(gaussians, case), seconds)
-
-    def _predict(self, case: EvalCase) -> tuple[Gaussians, float]:
-        """The Gaussians as `reconstruct` makes them of these views, and the seconds that it takes."""
-        views, span = _view_batch(case.context), DepthRange(case.near, case.far, "given")
-        started = time.perf_counter()
-        with reporting_to(None):
-            views, _ = compensate_exposure(views, ExposureMode.AUTO)
-            prediction = predict_views(self.predictor, views, span)
-            prediction = fuse(prediction, views, span, self.plan.filters).prediction
-            if self.plan.copy_side:
-                prediction = refine_prediction(prediction, views, self.plan, None).prediction
-        return prediction.need_gaussians(), time.perf_counter() - started
 
     def _measure(self, image: np.ndarray, truth: np.ndarray, valid: np.ndarray) -> dict[str, float]:
         scores = {
