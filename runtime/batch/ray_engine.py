@@ -24,6 +24,7 @@ LOG = logging.getLogger(__name__)
 INSTALL = "pip install 'idesplat[ray]'"
 OBJECT_STORE_BYTES = 80 << 20  # near the least that Ray takes: it holds records alone
 CONNECT_SECONDS = 10
+CHECK_SECONDS = 10  # without a result, after which it is asked whether Ray still runs
 MAX_STARTS = 3  # in a row, of actors that end before they get a scene
 # A Ray of our own serves this machine alone: on its loopback address, with a token that others do not know.
 OWN_RAY = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0", "RAY_AUTH_MODE": "token"}
@@ -78,7 +79,7 @@ class _Pool:
         for _ in range(workers):
             self._start()
         while self._running:
-            (done,), _ = self._ray.wait(list(self._running), num_returns=1)
+            done = self._next_done()
             actor, scene = self._running.pop(done)
             try:
                 outcome = self._ray.get(done)
@@ -100,6 +101,16 @@ class _Pool:
                 self._running.clear()  # actors that never started are not waited for
             if scene is not None:
                 yield outcome
+
+    def _next_done(self) -> Any:
+        """The reference to the next result. Raises InputError if no node of Ray is left that could make one."""
+        while True:
+            done, _ = self._ray.wait(list(self._running), num_returns=1, timeout=CHECK_SECONDS)
+            if done:
+                return done[0]
+            # Ray itself waits for ever where its only node ends while an actor starts.
+            if not any(node["Alive"] for node in self._ray.nodes()):
+                raise InputError("--engine ray: Ray has ended; run the same command again, it does what is missing")
 
     def _start(self) -> None:
         """Start an actor; Ray may let it wait for CPUs, while the others do the work."""
