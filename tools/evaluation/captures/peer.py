@@ -76,8 +76,9 @@ def compare(
         for count in steps or (views * plans[Quality.STANDARD].preset.steps_per_view,):
             scenes[f"OpenSplat, {count} steps"] = train_opensplat(opensplat, case, predicted, count)
         for name, (gaussians, seconds) in scenes.items():
-            table.add_row(source.name, name, *_scores(gaussians, case), f"{seconds:.1f}")
-            say(f"{source.name}, {name}: {' dB, SSIM '.join(_scores(gaussians, case))}, {seconds:.1f} s")
+            scores = _scores(gaussians, case)
+            table.add_row(source.name, name, *scores, f"{seconds:.1f}")
+            say(f"{source.name}, {name}: {' dB, SSIM '.join(scores)}, {seconds:.1f} s")
     print_table(table)
 
 
