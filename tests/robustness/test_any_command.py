@@ -200,7 +200,7 @@ def place(good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, presets: 
     temporary.mkdir()
     monkeypatch.chdir(work)
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))
-    monkeypatch.setattr("idesplat.tools.evaluation.evaluate.fetch_checkout", no_network)
+    monkeypatch.setattr("idesplat.tools.evaluation.captures.checkouts.fetch_checkout", no_network)
     monkeypatch.setattr(trainer.Trainer, "fit", lambda self, *arguments: None)  # training itself has tests of its own
     monkeypatch.setenv("IDESPLAT_RUN_LIMIT", "20")
     monkeypatch.setenv("HF_ENDPOINT", "http://127.0.0.1:9")  # nobody listens there

@@ -24,11 +24,10 @@ from ...runtime.inference.session import SessionConfig
 from ...runtime.reconstruction.quality import Quality
 from ...runtime.reconstruction.steps import make_plan
 from ...runtime.splats.filtering import FilterOptions
-from ...runtime.system.files import scratch_folder
 from ...runtime.system.progress import progress
 from ...runtime.views.batch import match_images_to_cameras
 from .captures.capture import CaptureImages, read_captures
-from .captures.checkouts import clones_folder, extract, fetch_checkout
+from .captures.checkouts import clones_folder, frames_of
 from .captures.scores import CaptureEvaluator, CaptureScores, Show
 from .cases import EvalCase, synthetic_case
 from .chunks import NEAR_PLANE_FACTOR, chunk_cases, find_chunks, read_index
@@ -227,9 +226,7 @@ def evaluate_captures(
     plan = make_plan(quality, predictor.model, refine, FilterOptions(), 0)
     evaluator, found = CaptureEvaluator(predictor, perceptual, plan), []
     for capture in progress(chosen, "evaluating"):
-        with scratch_folder() as images:
-            checkout = fetch_checkout(folder, capture.repository, capture.commit)
-            extract(checkout, capture.commit, capture.folder, capture.frames, images)
+        with frames_of(folder, capture) as images:
             loaded = CaptureImages(capture, images, shape)
             found.append(evaluator.evaluate(capture, loaded, view_counts, on_target))
     return CaptureEvaluation(predictor.model.path, predictor.metadata, shape, list(view_counts), found, warnings)

@@ -18,9 +18,9 @@ from ...runtime.reconstruction.quality import Quality
 from ...runtime.rendering.cameras import orbit_cameras
 from ...runtime.rendering.render import render_view
 from ...runtime.splats.gaussians import Gaussians
-from ...runtime.system.files import atomic_write, make_folder, scratch_folder
+from ...runtime.system.files import atomic_write, make_folder
 from ..evaluation.captures.capture import Capture, load_cropped, read_captures
-from ..evaluation.captures.checkouts import extract, fetch_checkout
+from ..evaluation.captures.checkouts import frames_of
 
 VIEWS = 6
 SIDE = 384  # pixels: longer side of each rendering
@@ -36,9 +36,7 @@ def figures(
     """Write NAME.jpg: prediction and finished scene at a held-out camera, and both from the side."""
     for capture in read_captures(names):
         path = make_folder(out) / f"capture-{capture.name}.jpg"
-        with scratch_folder() as folder:
-            checkout = fetch_checkout(checkouts, capture.repository, capture.commit)
-            extract(checkout, capture.commit, capture.folder, capture.frames, folder)
+        with frames_of(checkouts, capture) as folder:
             row = _row(capture, folder)
         image = np.ascontiguousarray(to_uint8(np.hstack(row))[..., ::-1])
         with atomic_write(path) as temporary:

@@ -2,12 +2,14 @@
 
 import os
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from ....runtime.errors import InputError
 from ....runtime.system.cache_folder import cache_folder
 from ....runtime.system.files import make_folder, scratch_folder
+from .capture import Capture
 
 CLONES = "captures"  # in idesplat's cache folder
 HOST = "https://github.com"
@@ -49,6 +51,15 @@ def fetch_checkout(folder: Path, repository: str, commit: str, host: str = HOST)
         _git(fetched, "remote", "add", "origin", f"{host}/{repository}")
         _git(fetched, "fetch", "--quiet", "--depth=1", "--filter=blob:none", "origin", commit)
         return fetched.rename(target)
+
+
+@contextmanager
+def frames_of(checkouts: Path, capture: Capture) -> Iterator[Path]:
+    """A folder with a capture's frames, for the block. checkouts: the folder of checkouts; raises InputError."""
+    checkout = fetch_checkout(checkouts, capture.repository, capture.commit)
+    with scratch_folder() as folder:
+        extract(checkout, capture.commit, capture.folder, capture.frames, folder)
+        yield folder
 
 
 def extract(checkout: Path, commit: str, folder: str, names: Sequence[str], into: Path) -> None:

@@ -37,7 +37,7 @@ from ..metrics import psnr, ssim
 from ..novel_views import render_target
 from ..report import print_table
 from .capture import CaptureImages, read_captures
-from .checkouts import extract, fetch_checkout
+from .checkouts import frames_of
 from .scores import CaptureEvaluator
 
 SIZE = (256, 256)
@@ -67,9 +67,7 @@ def compare(
         context, targets = source.window(views)
         if not context:
             continue
-        with scratch_folder() as images:
-            checkout = fetch_checkout(checkouts, source.repository, source.commit)
-            extract(checkout, source.commit, source.folder, source.frames, images)
+        with frames_of(checkouts, source) as images:
             case = CaptureImages(source, images, SIZE).case(context, targets, predictor.depth_range)
             scenes = {name: CaptureEvaluator(predictor, {}, plan).predict(case) for name, plan in plans.items()}
         predicted = scenes[Quality.FAST][0]

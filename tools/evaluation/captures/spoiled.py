@@ -23,13 +23,12 @@ from ....runtime.cli.terminal import run, say
 from ....runtime.errors import InputError
 from ....runtime.images.colormaps import to_uint8
 from ....runtime.images.io import load_image
-from ....runtime.system.files import scratch_folder
 from ....runtime.views.checks import find_defects
 from ....runtime.views.loader import ViewLoader
 from ....runtime.views.selection import PairScorer, guess_scene_depths
 from ..report import print_table
 from .capture import Capture, read_captures
-from .checkouts import extract, fetch_checkout
+from .checkouts import frames_of
 
 Posed = tuple[np.ndarray, Camera]  # image, uint8 RGB [height, width, 3], and its camera
 Spoil = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]  # of a frame, another frame, another scene
@@ -79,10 +78,8 @@ def count_spoiled(
 
 def _load(capture: Capture, checkouts: Path) -> list[Posed]:
     """All frames of a capture, reduced, with their cameras."""
-    checkout = fetch_checkout(checkouts, capture.repository, capture.commit)
     pairs = []
-    with scratch_folder() as folder:
-        extract(checkout, capture.commit, capture.folder, capture.frames, folder)
+    with frames_of(checkouts, capture) as folder:
         for name, camera in capture.cameras.items():
             image = load_image(folder / name)
             pairs.append(shrink(image, resize_camera(camera, image.shape[1], image.shape[0]), SIDE))
