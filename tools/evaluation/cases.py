@@ -5,6 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
+from ...runtime.cameras.camera import Camera
 from ...runtime.geometry.consistency import project_to_view
 from ...runtime.geometry.intrinsics import denormalize_intrinsics
 from ...runtime.splats.points import unproject
@@ -46,6 +47,13 @@ class PosedImages:
         """One view's intrinsics in pixels, pixel centres at .5, [3, 3], float64."""
         height, width = self.images.shape[2:]
         return denormalize_intrinsics(self.intrinsics[view], width, height)
+
+    def cameras(self) -> list[Camera]:
+        """The camera of each image, by its name; raises InputError as `Camera`."""
+        height, width = self.images.shape[2:]
+        return [
+            Camera(name, width, height, self.K(view), self.extrinsics[view]) for view, name in enumerate(self.names)
+        ]
 
 
 @dataclass(frozen=True, eq=False)

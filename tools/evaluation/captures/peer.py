@@ -10,7 +10,7 @@ options are the defaults, but for the number of steps and the size of the images
 import json
 import subprocess
 import time
-from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -18,7 +18,6 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from ....runtime.cameras.camera import Camera
 from ....runtime.cameras.formats import transforms
 from ....runtime.cli.terminal import run, say
 from ....runtime.errors import InputError
@@ -101,11 +100,7 @@ def train_opensplat(opensplat: Path, case: EvalCase, predicted: Gaussians, steps
 def write_project(folder: Path, case: EvalCase, predicted: Gaussians) -> None:
     """Write the context views as a project of Nerfstudio: images, transforms.json and points.ply."""
     context = case.context
-    height, width = context.images.shape[2:]
-    cameras: Sequence[Camera] = [
-        Camera(f"{view:03}.png", width, height, context.K(view), context.extrinsics[view])
-        for view in range(len(context))
-    ]
+    cameras = [replace(camera, name=f"{view:03}.png") for view, camera in enumerate(context.cameras())]
     for view, camera in enumerate(cameras):
         save_png(folder / camera.name, context.image(view))
     _write_points(folder / POINTS, points_from_gaussians(predicted))

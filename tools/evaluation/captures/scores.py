@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ....runtime.cameras.camera import Camera
 from ....runtime.cameras.undistortion import UndistortedImage
 from ....runtime.images.colormaps import to_uint8
 from ....runtime.inference.predictor import Predictor
@@ -180,11 +179,7 @@ def _input_psnr(gaussians: Gaussians, case: EvalCase) -> float:
 
 def _view_batch(context: PosedImages) -> ViewBatch:
     """Context views as a reconstruction has them; they are refined on at the size that the network gets."""
-    height, width = context.images.shape[2:]
-    cameras = [
-        Camera(name, width, height, context.K(view), context.extrinsics[view])
-        for view, name in enumerate(context.names)
-    ]
+    cameras = context.cameras()
     copies = [
         UndistortedImage(to_uint8(context.image(view)), camera, context.valid[view])
         for view, camera in enumerate(cameras)
