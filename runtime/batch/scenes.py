@@ -42,7 +42,8 @@ def _one_of(kind: type[StrEnum]) -> Callable[[str], StrEnum]:
     return parse
 
 
-def _flag(text: str) -> bool:
+def parse_flag(text: str) -> bool:
+    """Whether a text says true; raises InputError unless it is true, false, 1 or 0 in small or capital letters."""
     if text.lower() not in FLAGS:
         raise InputError("expected true or false")
     return FLAGS[text.lower()]
@@ -54,9 +55,9 @@ FILTERS: dict[str, Callable[[str], Any]] = {
     "crop_border": int,
     "max_depth_jump": float,
     "min_consistency": float,
-    "remove_contradicted": _flag,
-    "merge_duplicates": _flag,
-    "close_holes": _flag,
+    "remove_contradicted": parse_flag,
+    "merge_duplicates": parse_flag,
+    "close_holes": parse_flag,
 }
 OPTIONS: dict[str, Callable[[str], Any]] = {
     "camera_format": _one_of(CameraFormat),
@@ -65,7 +66,7 @@ OPTIONS: dict[str, Callable[[str], Any]] = {
     "select": str,
     "views": parse_views,
     "size": parse_size,
-    "crop": _flag,
+    "crop": parse_flag,
     "refine": str,
     "max_gaussians": int,
     "near": float,

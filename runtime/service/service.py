@@ -12,6 +12,8 @@ from pathlib import Path
 
 from starlette.requests import Request
 
+from ..batch.scenes import parse_flag
+from ..errors import error_context
 from ..inference.bundled_model import bundled_model
 from ..inference.model_files import ModelFiles
 from ..reconstruction.quality import Quality
@@ -35,7 +37,6 @@ CONVERSIONS = 1  # at a time
 MAX_CONVERSIONS_WAITING = 16
 CONVERT_S = 300.0
 SAVE_DEPTH, RENDER = "save_depth", "render"
-SAVE_FLAGS = {"true": True, "1": True, "false": False, "0": False}
 
 
 @dataclass(frozen=True)
@@ -138,11 +139,10 @@ class Service:
 
 
 def _flag(texts: dict[str, str], name: str, default: bool) -> bool:
-    """Take a field that says whether something is written, too."""
+    """Take a field that says whether something is written, too. Raises InputError."""
     text = texts.pop(name, "").lower()
-    if text and text not in SAVE_FLAGS:
-        raise Refused(422, f"{name} {text[:40]!r}: expected true or false")
-    return SAVE_FLAGS.get(text, default)
+    with error_context(f"{name} {text[:40]!r}"):
+        return parse_flag(text) if text else default
 
 
 async def _convert(source: Path, target: Path) -> None:
