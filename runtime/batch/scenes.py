@@ -148,7 +148,7 @@ def check_options(options: Mapping[str, Any]) -> None:
     unknown = sorted(set(options) - set(OPTIONS))
     if unknown:
         raise InputError(f"unknown option {unknown[0]!r}; expected {', '.join(OPTIONS)}")
-    FilterOptions(**{name: options[name] for name in FILTERS if name in options})
+    split_filters(options)
 
 
 def _read(place: Place) -> Iterator[Scene]:
@@ -234,6 +234,12 @@ def _parsed(name: str, text: str) -> Any:
             raise
         except ValueError:
             raise InputError("expected a number") from None
+
+
+def split_filters(options: Mapping[str, Any]) -> tuple[FilterOptions, dict[str, Any]]:
+    """The filters among options, and the other options; raises InputError for filters that cannot be."""
+    filters = FilterOptions(**{name: value for name, value in options.items() if name in FILTERS})
+    return filters, {name: value for name, value in options.items() if name not in FILTERS}
 
 
 def _checked_id(name: str) -> str:

@@ -18,7 +18,6 @@ from ..inference.predictor import Predictor
 from ..inference.providers import candidates
 from ..inference.session import SessionConfig
 from ..reconstruction.pipeline import reconstruct
-from ..splats.filtering import FilterOptions
 from ..system.memory import peak_bytes, reset_peak
 from ..system.outputs import outputs
 from ..system.threads import limit_threads
@@ -42,7 +41,7 @@ from .records import (
     write_text,
 )
 from .results import Results, open_results
-from .scenes import FILTERS, Scene
+from .scenes import Scene, split_filters
 
 LOG = logging.getLogger(__name__)
 
@@ -161,8 +160,7 @@ class Worker:
 
     def _reconstruct(self, scene: Scene, results: Results, predictor: Predictor) -> dict[str, Any]:
         """Write the splats and the picture; the record of them."""
-        options = {**self.settings.options, **scene.options}
-        filters = FilterOptions(**{name: options.pop(name) for name in FILTERS if name in options})
+        filters, options = split_filters({**self.settings.options, **scene.options})
         result = reconstruct(scene.images, scene.cameras, model=predictor, filters=filters, **options)
         finished = time.perf_counter()
         splats = splats_name(self.settings.splat_format)

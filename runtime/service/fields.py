@@ -5,12 +5,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..batch.scenes import FILTERS, OPTIONS
+from ..batch.scenes import OPTIONS, split_filters
 from ..cameras.formats import CameraFormat
 from ..errors import InputError, error_context
 from ..inference.inputs import ALL, select_images
 from ..reconstruction.quality import PRESETS, Quality, parse_refine
-from ..splats.filtering import FilterOptions
 from ..views.exposure_mode import ExposureMode
 from ..views.world_offset import parse_offset
 from .limits import Limits, Refused
@@ -101,7 +100,7 @@ def _parsed(name: str, text: str) -> Any:
 
 def _check_values(options: Mapping[str, Any]) -> None:
     """Raise InputError for what a reconstruction would refuse, before anything is queued."""
-    FilterOptions(**{name: options[name] for name in FILTERS if name in options})
+    split_filters(options)
     parse_offset(options.get("offset", "auto"))
     parse_refine(options.get("refine", "0"))
     if options.get("max_gaussians", 0) < 0:

@@ -19,7 +19,7 @@ from typing import Any, TextIO
 
 import cv2
 
-from ..batch.scenes import FILTERS, OPTIONS
+from ..batch.scenes import OPTIONS, split_filters
 from ..cameras.image_files import confine_to
 from ..cameras.io import write_cameras
 from ..errors import InputError
@@ -27,7 +27,6 @@ from ..inference.predictor import Predictor
 from ..inference.session import SessionConfig
 from ..reconstruction.pipeline import reconstruct
 from ..reconstruction.result import Reconstruction
-from ..splats.filtering import FilterOptions
 from ..system.files import make_folder
 from ..system.output_names import CAMERAS_FILE, SPLATS, SUMMARY
 from ..system.progress import Progress, reporting_to
@@ -141,8 +140,7 @@ def _serve(order: Order, predictor: Predictor, reports: _Reports) -> None:
 
 def _reconstruct(order: Order, predictor: Predictor) -> dict[str, Any]:
     """Write the results; what is worth knowing of them at once."""
-    options = {name: OPTIONS[name](text) for name, text in order.options.items()}
-    filters = FilterOptions(**{name: options.pop(name) for name in FILTERS if name in options})
+    filters, options = split_filters({name: OPTIONS[name](text) for name, text in order.options.items()})
     result = reconstruct(order.images, order.cameras, model=predictor, filters=filters, **options)
     folder = make_folder(Path(order.folder))
     notes = [*result.notes, *result.save(folder / SCENE)]
