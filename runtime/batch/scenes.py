@@ -220,20 +220,24 @@ def make_scene(row: Mapping[Any, Any], table: Place) -> Scene:
         raise InputError(f"unknown column {unknown[0]!r}; expected id, images, cameras, {', '.join(OPTIONS)}")
     if "id" not in given or "images" not in given:
         raise InputError("expected both id and images")
-    options = {name: _parsed(name, given[name]) for name in OPTIONS if name in given}
+    options = {}
+    for name in OPTIONS:
+        if name in given:
+            with error_context(f"{name} {given[name]!r}"):
+                options[name] = parse_option(name, given[name])
     cameras = given.get("cameras")
     place = beside(table, cameras) if cameras and cameras != ESTIMATE else cameras
     return Scene(_checked_id(given["id"]), beside(table, given["images"]), place, options)
 
 
-def _parsed(name: str, text: str) -> Any:
-    with error_context(f"{name} {text!r}"):
-        try:
-            return OPTIONS[name](text)
-        except InputError:
-            raise
-        except ValueError:
-            raise InputError("expected a number") from None
+def parse_option(name: str, text: str) -> Any:
+    """The value of an option of `OPTIONS` in text; raises InputError, whose message the caller gives a context."""
+    try:
+        return OPTIONS[name](text)
+    except InputError:
+        raise
+    except ValueError:
+        raise InputError("expected a number") from None
 
 
 def split_filters(options: Mapping[str, Any]) -> tuple[FilterOptions, dict[str, Any]]:

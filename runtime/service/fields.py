@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..batch.scenes import OPTIONS, split_filters
+from ..batch.scenes import OPTIONS, parse_option, split_filters
 from ..cameras.formats import CameraFormat
 from ..errors import InputError, error_context
 from ..inference.inputs import ALL, select_images
@@ -79,20 +79,15 @@ def parse_options(texts: Mapping[str, str], default: Quality, images: Sequence[P
         if len(text) > MAX_TEXT:
             raise InputError(f"{name}: {len(text)} characters, expected {MAX_TEXT} at most")
         if text:
-            options[name] = _parsed(name, text)
+            options[name] = _parse_field(name, text)
     _check_values(options)
     _check_limits(options, default, images, limits)
     return options
 
 
-def _parsed(name: str, text: str) -> Any:
+def _parse_field(name: str, text: str) -> Any:
     with error_context(f"{name} {text[:40]!r}"):
-        try:
-            value = OPTIONS[name](text)
-        except InputError:
-            raise
-        except ValueError:
-            raise InputError("expected a number") from None
+        value = parse_option(name, text)
         if isinstance(value, float) and not math.isfinite(value):
             raise InputError("expected a finite number")
         return value

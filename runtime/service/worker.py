@@ -19,7 +19,7 @@ from typing import Any, TextIO
 
 import cv2
 
-from ..batch.scenes import OPTIONS, split_filters
+from ..batch.scenes import parse_option, split_filters
 from ..cameras.image_files import confine_to
 from ..cameras.io import write_cameras
 from ..errors import InputError
@@ -140,7 +140,7 @@ def _serve(order: Order, predictor: Predictor, reports: _Reports) -> None:
 
 def _reconstruct(order: Order, predictor: Predictor) -> dict[str, Any]:
     """Write the results; what is worth knowing of them at once."""
-    filters, options = split_filters({name: OPTIONS[name](text) for name, text in order.options.items()})
+    filters, options = split_filters({name: parse_option(name, text) for name, text in order.options.items()})
     result = reconstruct(order.images, order.cameras, model=predictor, filters=filters, **options)
     folder = make_folder(Path(order.folder))
     notes = [*result.notes, *result.save(folder / SCENE)]
