@@ -5,15 +5,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..inference.model_files import read_model
 from ..inference.named_models import find_model
-from ..inference.providers import CPU, candidates
+from ..inference.providers import CPU
 from ..inference.session import DEFAULT, SessionConfig, usable_cores
-from .cache import DEFAULT_GB, GB
+from .cache import DEFAULT_GB
 from .places import join, parse_place
-from .records import PLY, model_sha256, splats_name
-from .scenes import check_options, make_scene
-from .worker import Settings, Worker, start_worker
+from .records import PLY, splats_name
+from .scenes import make_scene
+from .worker import Worker, check_settings, make_settings, start_worker
 
 
 class SceneReconstructor:
@@ -41,22 +40,18 @@ class SceneReconstructor:
         cache_gb: float = DEFAULT_GB,
         overwrite: bool = False,
     ) -> None:
-        check_options(options or {})
-        candidates(provider)
-        self._splats = splats_name(splat_format)
-        files = read_model(find_model(model))
+        check_settings(options, provider, splat_format)
         self._threads = session.threads or usable_cores()
-        self._settings = Settings(
-            files,
-            model_sha256(files),
-            provider,
-            replace(session, threads=self._threads),
-            dict(options or {}),
+        self._settings = make_settings(
+            find_model(model),
             parse_place(out),
-            splat_format,
-            retry_failed,
-            overwrite,
-            int(cache_gb * GB),
+            options=options,
+            splat_format=splat_format,
+            provider=provider,
+            session=replace(session, threads=self._threads),
+            retry_failed=retry_failed,
+            cache_gb=cache_gb,
+            overwrite=overwrite,
         )
         self._worker: Worker | None = None
 
@@ -72,10 +67,10 @@ class SceneReconstructor:
             self._worker = start_worker(self._settings, self._threads)
         scene = make_scene(row, Path("rows"))
         record = self._worker.run(scene).record
-        is_done = "error" not in record
+        splats = join(join(self._settings.out, scene.id), splats_name(self._settings.splat_format))
         return {
             "id": scene.id,
             "status": str(record["status"]),
-            "splats": str(join(join(self._settings.out, scene.id), self._splats)) if is_done else None,
+            "splats": str(splats) if "error" not in record else None,
             **{name: record.get(name) for name in ("error", "gaussians", "psnr", "seconds", "peak_memory")},
         }

@@ -11,20 +11,19 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..inference.model_files import read_model
 from ..inference.named_models import find_model
-from ..inference.providers import CPU, candidates
+from ..inference.providers import CPU
 from ..inference.session import DEFAULT, SessionConfig, usable_cores
 from ..system.progress import progress
-from .cache import DEFAULT_GB, GB
+from .cache import DEFAULT_GB
 from .index import Index
 from .places import Place, join, parse_place
 from .pool import run_in_pool
 from .ray_engine import run_on_ray
-from .records import PLY, Status, check_own, model_sha256, splats_name, write_text
+from .records import PLY, Status, check_own, splats_name, write_text
 from .results import open_results
-from .scenes import Scenes, check_options, parse_shard, read_scenes
-from .worker import Outcome, Settings
+from .scenes import Scenes, parse_shard, read_scenes
+from .worker import Outcome, Settings, check_settings, make_settings
 
 MAX_LISTED = 1000  # failures in a summary
 
@@ -118,24 +117,21 @@ def batch(
     if engine == Engine.RAY:  # its actors need not have this process's current folder
         source, target = (place.absolute() if isinstance(place, Path) else place for place in (source, target))
     chosen = read_scenes(source).of_shard(shard)
-    _check(engine, address, workers, cache_gb, options or {}, [chosen.source, target])
-    candidates(provider)
-    splats = splats_name(splat_format)
+    _check(engine, address, workers, cache_gb, [chosen.source, target])
+    check_settings(options, provider, splat_format)
     if isinstance(target, Path):
-        _check_local(chosen, target, None if overwrite else splats)
-    files = read_model(find_model(model).absolute())
+        _check_local(chosen, target, None if overwrite else splats_name(splat_format))
     threads = session.threads or (1 if address else max(1, usable_cores() // workers))
-    settings = Settings(
-        files,
-        model_sha256(files),
-        provider,
-        replace(session, threads=threads),
-        dict(options or {}),
+    settings = make_settings(
+        find_model(model).absolute(),
         target,
-        splat_format,
-        retry_failed,
-        overwrite,
-        int(cache_gb * GB),
+        options=options,
+        splat_format=splat_format,
+        provider=provider,
+        session=replace(session, threads=threads),
+        retry_failed=retry_failed,
+        cache_gb=cache_gb,
+        overwrite=overwrite,
     )
     summary, index = Summary(len(chosen)), Index()
     failures = 0
@@ -178,9 +174,7 @@ def _run(
     return run_in_pool(scenes, workers, threads, settings)
 
 
-def _check(
-    engine: str, address: str | None, workers: int, cache_gb: float, options: Mapping[str, Any], places: list[Place]
-) -> None:
+def _check(engine: str, address: str | None, workers: int, cache_gb: float, places: list[Place]) -> None:
     """Raise InputError for invalid arguments."""
     if engine not in tuple(Engine):
         raise InputError(f"--engine {engine}: expected {' or '.join(Engine)}")
@@ -190,7 +184,6 @@ def _check(
         raise InputError(f"--workers {workers}: expected 1 or more")
     if not 0 <= cache_gb < float("inf"):
         raise InputError(f"--cache-size {cache_gb}: expected a number of gigabytes")
-    check_options(options)
     for place in places:
         if isinstance(place, str) and place.startswith("memory:"):
             raise InputError(f"{place}: lives in one process, and a batch has several; use SceneReconstructor")

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import cv2
 
 from ..errors import InputError
-from ..inference.model_files import ModelFiles
+from ..inference.model_files import ModelFiles, read_model
 from ..inference.predictor import Predictor
 from ..inference.providers import candidates
 from ..inference.session import SessionConfig
@@ -35,13 +35,14 @@ from .records import (
     files_of,
     fingerprint,
     is_done,
+    model_sha256,
     read_record,
     splats_name,
     write_record,
     write_text,
 )
 from .results import Results, open_results
-from .scenes import Scene, split_filters
+from .scenes import Scene, check_options, split_filters
 
 LOG = logging.getLogger(__name__)
 
@@ -66,6 +67,44 @@ class Settings:
     retry_failed: bool = False
     overwrite: bool = False
     cache_bytes: int = int(DEFAULT_GB * GB)
+
+
+def check_settings(options: Mapping[str, Any] | None, provider: str, splat_format: str) -> None:
+    """Raise InputError for arguments of `make_settings` that are invalid, before a model is looked for."""
+    check_options(options or {})
+    candidates(provider)
+    splats_name(splat_format)
+
+
+def make_settings(
+    model: Path,
+    out: Place,
+    *,
+    options: Mapping[str, Any] | None,
+    splat_format: str,
+    provider: str,
+    session: SessionConfig,
+    retry_failed: bool,
+    cache_gb: float,
+    overwrite: bool,
+) -> Settings:
+    """The settings that checked arguments of `batch` and `SceneReconstructor` give. model: its path.
+
+    Raises InputError if the model cannot be read.
+    """
+    files = read_model(model)
+    return Settings(
+        files,
+        model_sha256(files),
+        provider,
+        session,
+        dict(options or {}),
+        out,
+        splat_format,
+        retry_failed,
+        overwrite,
+        int(cache_gb * GB),
+    )
 
 
 class Outcome(NamedTuple):
