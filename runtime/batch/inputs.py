@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 from ..cameras.discovery import find_cameras
-from ..cameras.formats import ESTIMATE
+from ..cameras.formats import CAMERA_SUFFIXES, ESTIMATE
 from ..cameras.io import input_files
 from ..errors import InputError
 from ..images.finding import SUFFIXES, VIDEO_SUFFIXES, find_images, is_video
@@ -18,8 +18,6 @@ from .cache import InputCache, StoredFile
 from .places import open_store, store_errors
 from .results import file_sha256, store_tag
 from .scenes import Scene
-
-CAMERA_SUFFIXES = (".json", ".txt", ".bin", ".npy", ".xml", ".yml", ".yaml")
 
 
 class FileHash(NamedTuple):

@@ -8,12 +8,11 @@ import zlib
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
+from ..cameras.formats import CAMERA_SUFFIXES
 from ..errors import InputError, printable
 from ..images.finding import SUFFIXES
 from .limits import MIB, Limits, Refused
 
-# What cameras are made of: JSON, text, COLMAP's binaries, NumPy arrays, OpenCV's calibrations.
-CAMERA_SUFFIXES = (".json", ".txt", ".bin", ".npy", ".yml", ".yaml", ".xml")
 MAX_ENTRIES_BEYOND_IMAGES = 1000
 MAX_DIRECTORY = 4 * MIB  # bytes of the list of entries, which zipfile reads whole
 MAX_DEPTH = 8  # folders within each other

@@ -11,11 +11,11 @@ from starlette.datastructures import FormData, UploadFile
 from starlette.requests import Request
 from starlette.types import Message, Receive
 
-from ..cameras.formats import ESTIMATE
+from ..cameras.formats import CAMERA_SUFFIXES, ESTIMATE
 from ..errors import InputError
 from ..images.finding import SUFFIXES, find_images
 from ..images.header import DamagedImage, image_size
-from .archives import CAMERA_SUFFIXES, is_zip, safe_name, unpack
+from .archives import is_zip, safe_name, unpack
 from .limits import MIB, Limits, Refused
 
 IMAGES, CAMERAS = "images", "cameras"

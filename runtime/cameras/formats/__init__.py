@@ -19,6 +19,8 @@ from enum import StrEnum
 from importlib import import_module
 from types import ModuleType
 
+# Of the files of all formats: JSON, text, COLMAP's binaries, NumPy arrays, OpenCV's calibrations.
+CAMERA_SUFFIXES = (".json", ".txt", ".bin", ".npy", ".yml", ".yaml", ".xml")
 ESTIMATE = "estimate"  # given in place of a camera file: estimate the cameras from the images
 
 
