@@ -53,7 +53,7 @@ class StoredInputs:
         self._images = self._list_images(scene.images) if isinstance(scene.images, str) else scene.images
         self._cameras = scene.cameras
         if isinstance(scene.cameras, str) and scene.cameras != ESTIMATE:
-            self._cameras = self._list_cameras(scene.cameras)
+            self._cameras = self._add(scene.cameras, CAMERA_SUFFIXES)
 
     def hashes(self) -> list[FileHash]:
         """Size and checksum of each file as the store gives them; where it gives none, or files are local, by content.
@@ -89,9 +89,6 @@ class StoredInputs:
         if PurePosixPath(path).suffix.lower() in kinds and self.scene.cameras is None:
             self._add(posixpath.dirname(url), CAMERA_SUFFIXES, depth=1)
         return path
-
-    def _list_cameras(self, url: str) -> str:
-        return self._add(url, CAMERA_SUFFIXES)
 
     def _add(self, url: str, suffixes: tuple[str, ...], depth: int | None = None) -> str:
         """List the files of these endings at a URL: one file, all below a folder, or those that match a glob."""
