@@ -4,8 +4,10 @@ import re
 from dataclasses import dataclass
 from enum import StrEnum
 from math import inf
+from pathlib import Path
 
 from ..errors import InputError
+from ..inference.bundled_model import bundled_model
 
 STEPS_OR_SECONDS = re.compile(r"([0-9]{1,6})(s?)")
 MAX_STEPS = 100_000
@@ -56,6 +58,14 @@ PRESETS = {
     Quality.STANDARD: Preset(views=8, pixels=0, fuse=True, steps_per_view=20, seconds=40, copy_side=COPY_SIDE),
     Quality.HIGH: Preset(views=24, pixels=1 << 17, fuse=True, steps_per_view=30, seconds=180, copy_side=640),
 }
+
+
+def default_quality(model: Path) -> Quality:
+    """The preset where none is asked for: standard for the bundled model, and for others fast: what they predict.
+
+    model: its path. Raises InputError if the bundled model is missing or damaged.
+    """
+    return Quality.STANDARD if model == bundled_model() else Quality.FAST
 
 
 def parse_refine(text: str) -> RefinementLimit:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ..errors import InputError
-from ..inference.bundled_model import bundled_model
 from ..inference.model_files import ModelFiles
 from ..inference.predictor import Prediction
 from ..refinement.options import RefinementOptions, prediction_options
@@ -17,7 +16,7 @@ from ..splats.filtering import FilterOptions, describe_removed, filter_gaussians
 from ..views.batch import ViewBatch
 from ..views.depth_range import DepthRange
 from .many_views import voting_views
-from .quality import PRESETS, Preset, Quality, RefinementLimit, parse_refine
+from .quality import PRESETS, Preset, Quality, RefinementLimit, default_quality, parse_refine
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ class Stepped:
 def make_plan(
     quality: Quality | str | None, model: ModelFiles, refine: str | None, filters: FilterOptions, max_gaussians: int
 ) -> Plan:
-    """The plan for a quality; by default standard for the bundled model, and for others fast: what they predict.
+    """The plan for a quality, by default that of `default_quality`.
 
     Raises InputError for a quality or a refinement that is none.
     """
@@ -67,8 +66,7 @@ def make_plan(
         raise InputError(f"--quality {quality}: expected one of {', '.join(Quality)}")
     if max_gaussians < 0:
         raise InputError(f"--max-gaussians {max_gaussians}: expected a number of Gaussians, or 0 for all")
-    default = Quality.STANDARD if model.path == bundled_model() else Quality.FAST
-    preset = PRESETS[Quality(quality or default)]
+    preset = PRESETS[Quality(quality or default_quality(model.path))]
     if preset.fuse and model.metadata.gaussians:
         filters = replace(filters, remove_contradicted=True, remove_redundant=True, close_holes=True)
     limit = parse_refine(refine) if refine is not None else None

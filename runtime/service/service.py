@@ -14,9 +14,8 @@ from starlette.requests import Request
 
 from ..batch.scenes import parse_flag
 from ..errors import error_context
-from ..inference.bundled_model import bundled_model
 from ..inference.model_files import ModelFiles
-from ..reconstruction.quality import Quality
+from ..reconstruction.quality import default_quality
 from ..splats.io import FORMATS
 from ..system.output_names import POINT_ENDINGS
 from .fields import parse_options
@@ -91,7 +90,7 @@ class Service:
                 raise Refused(507, "the service cannot store the upload; try again later", MAX_WAIT_S) from None
             texts = dict(upload.texts)
             depth, render = (_flag(texts, option, default) for option, default in ((SAVE_DEPTH, True), (RENDER, False)))
-            parse_options(texts, self._default_quality(), upload.images, self.settings.limits)
+            parse_options(texts, default_quality(self.settings.model.path), upload.images, self.settings.limits)
             given = {option: text for option, text in texts.items() if text}
             job = Job(name, folder, upload, given, depth, render)
             self.jobs.add(job)
@@ -127,10 +126,6 @@ class Service:
         await self.pool.stop()
         if running:
             await asyncio.sleep(LINGER_S)
-
-    def _default_quality(self) -> Quality:
-        bundled = self.settings.model.path == bundled_model()
-        return Quality.STANDARD if bundled else Quality.FAST
 
     async def _sweep(self) -> None:
         while True:
