@@ -25,6 +25,7 @@ OPENING_S = 2.0  # between the end of a job and the removal of its files: answer
 MAX_WAIT_S = 60  # of Retry-After
 USUAL_S = 10.0  # of a job, before any has been done
 SMOOTHING = 0.2  # weight of the last job in their mean time
+STOPPED = "the service was stopped; send the scene again"  # the error of jobs that it ended
 
 
 class State(StrEnum):
@@ -148,8 +149,7 @@ class Jobs:
 
         Raises Refused where the service stops, the queue is full, or the files of unfinished jobs take all storage.
         """
-        if self.draining:
-            raise Refused(503, "the service stops; try again later", self.retry_after())
+        self._check_open()
         if self.waiting + self.uploading >= self.limits.queue:
             raise Refused(429, "too many scenes wait; try again later", self.retry_after())
         if not self._make_room():
@@ -168,8 +168,7 @@ class Jobs:
 
     def add(self, job: Job) -> None:
         """Queue a job. Raises Refused where the service has begun to stop."""
-        if self.draining:
-            raise Refused(503, "the service stops; try again later", self.retry_after())
+        self._check_open()
         job.size = folder_size(job.folder)
         self._jobs[job.id] = job
         self._queue.append(job)
@@ -224,7 +223,7 @@ class Jobs:
         """Take no more jobs, and answer for those in the queue."""
         self.draining = True
         while self._queue:
-            self.finish(self._queue.popleft(), State.FAILED, "the service was stopped; send the scene again")
+            self.finish(self._queue.popleft(), State.FAILED, STOPPED)
 
     def remove_expired(self) -> None:
         """Remove the finished jobs that are older than `keep_seconds`, or more than `MAX_KEPT`."""
@@ -234,6 +233,11 @@ class Jobs:
         for index, job in enumerate(finished):
             if index < surplus or (job.finished or 0) < oldest:
                 self._remove(job)
+
+    def _check_open(self) -> None:
+        """Raise Refused where the service has begun to stop."""
+        if self.draining:
+            raise Refused(503, "the service stops; try again later", self.retry_after())
 
     def _make_room(self) -> bool:
         """Remove the oldest results where the storage is full; whether there is room then."""

@@ -13,7 +13,7 @@ from typing import Any
 
 from ..errors import InputError
 from ..system.limits import IMAGE_MEGAPIXELS
-from .jobs import Job, Jobs, State
+from .jobs import STOPPED, Job, Jobs, State
 from .limits import TOKEN_VARIABLE, Limits
 from .worker import Order, Setup, as_line
 
@@ -175,7 +175,7 @@ class Pool:
                 limit = f"it took longer than {self.limits.seconds:g} s, the limit of this service"
                 self.jobs.finish(job, State.FAILED, f"{limit}; {MEMORY}")
         except asyncio.CancelledError:
-            self.jobs.finish(job, State.FAILED, "the service was stopped; send the scene again")
+            self.jobs.finish(job, State.FAILED, STOPPED)
             raise
         finally:
             work.cancel()
