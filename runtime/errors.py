@@ -43,6 +43,11 @@ def printable(text: str) -> str:
     return "".join(character if _is_shown(character) else _escape(character) for character in text)
 
 
+def one_line(error: BaseException) -> str:
+    """The message of any exception as one line; the name of its type if it has none."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
 def report_error(message: str) -> None:
     """Print an error as one line on stderr, if it is writable; the middle of a very long one is left out."""
     line = printable(" ".join(message.split()))

@@ -9,7 +9,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from ...model.checkpoint import file_sha256
-from ...runtime.errors import InputError
+from ...runtime.errors import InputError, one_line
 from ...runtime.inference.known_models import REVISION, KnownModel
 from ...runtime.system.cache_folder import cache_folder
 from ...runtime.system.files import make_folder
@@ -93,10 +93,10 @@ def _download(model: KnownModel, revision: str, folder: Path) -> Path:
                 tqdm_class=_progress_bar(CALLBACK.get(), f"downloading {model.file}"),
             )
     except Exception as error:  # of the hub's library, of its HTTP library, of the system
-        reason = " ".join(str(error).split())
         raise InputError(
             f"{model.file} cannot be downloaded from {endpoint or 'huggingface.co'}/{model.repository} at {revision} "
-            f"({reason}); pull it again to resume, set HF_ENDPOINT to a mirror, or give a folder that has it as --from"
+            f"({one_line(error)}); pull it again to resume, set HF_ENDPOINT to a mirror, or give a folder that has it "
+            "as --from"
         ) from None
     try:
         # The hub states the SHA-256 of large files as their ETag.

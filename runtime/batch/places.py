@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
-from ..errors import InputError
+from ..errors import InputError, one_line
 
 if TYPE_CHECKING:
     from fsspec import AbstractFileSystem
@@ -87,5 +87,4 @@ def store_errors(url: str) -> Iterator[None]:
     except FileNotFoundError as error:
         raise InputError(f"{url}: no such file or folder") from error
     except Exception as error:
-        line = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{url}: the store answers: {line}; check its name and credentials") from error
+        raise InputError(f"{url}: the store answers: {one_line(error)}; check its name and credentials") from error

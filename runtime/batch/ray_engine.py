@@ -14,7 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from ..errors import InputError
+from ..errors import InputError, one_line
 from ..system.files import scratch_folder
 from .scenes import Scene
 from .worker import Outcome, Settings, record_killed, start_worker
@@ -88,7 +88,7 @@ class _Pool:
                     raise InputError(str(error.cause)) from None
                 raise error.cause from None
             except self._ray.exceptions.RayError as error:
-                LOG.warning("an actor ended: %s", " ".join(str(error).split()))
+                LOG.warning("an actor ended: %s", one_line(error))
                 self._ray.kill(actor)
                 yield from self._after_end(scene, error)
                 self._start()
@@ -194,8 +194,9 @@ def _start_here(ray: ModuleType, cpus: int, folder: Path) -> None:
             **SILENT,
         )
     except Exception as error:
-        line = " ".join(str(error).split())
-        raise InputError(f"--engine ray: Ray does not start: {line}; --engine local does without it") from error
+        raise InputError(
+            f"--engine ray: Ray does not start: {one_line(error)}; --engine local does without it"
+        ) from error
 
 
 def _connect(ray: ModuleType, address: str) -> None:
@@ -205,5 +206,6 @@ def _connect(ray: ModuleType, address: str) -> None:
             socket.create_connection((host.strip("[]"), int(port)), CONNECT_SECONDS).close()
         ray.init(address=address, **SILENT)
     except Exception as error:
-        line = " ".join(str(error).split())
-        raise InputError(f"--address {address}: no Ray cluster is reached: {line}; see `ray status`") from error
+        raise InputError(
+            f"--address {address}: no Ray cluster is reached: {one_line(error)}; see `ray status`"
+        ) from error

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import cv2
 
-from ..errors import InputError
+from ..errors import InputError, one_line
 from ..inference.model_files import ModelFiles, read_model
 from ..inference.predictor import Predictor
 from ..inference.providers import candidates
@@ -224,7 +224,7 @@ class Worker:
 
     def _fail(self, scene: Scene, made_from: str | None, error: Exception, started: float) -> dict[str, Any]:
         """The record of a failure; written, but for a disk that is full or the like, and then the scene is not done."""
-        line = " ".join(str(error).split()) or type(error).__name__
+        line = one_line(error)
         line = line if isinstance(error, InputError) else f"{type(error).__name__}: {line}"
         seconds = time.perf_counter() - started
         record = {"id": scene.id, "status": Status.FAILED, "error": line, "hash": made_from, "seconds": seconds}

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import onnxruntime
 
-from ..errors import InputError
+from ..errors import InputError, one_line
 from ..system.files import check_regular
 from .engine_cache import engine_folder
 from .graph_cache import cache_entry
@@ -334,7 +334,7 @@ def _watchdog(options: onnxruntime.RunOptions, ended: threading.Event, limit_s: 
 
 def _reason(error: Exception) -> str:
     """ONNX Runtime's message in one line, without status codes and source locations."""
-    text = " ".join(str(error).split())
+    text = one_line(error)
     _, found, message = text.partition("Status Message: ")
     reason = SOURCE.sub("", message if found else text.split(" : ")[-1])
     return reason if len(reason) <= MAX_REASON else reason[:MAX_REASON] + "..."

@@ -12,7 +12,7 @@ from prometheus_client import CONTENT_TYPE_LATEST
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp
 
-from ..errors import InputError
+from ..errors import InputError, one_line
 from ..system.output_names import CAMERAS_FILE, SUMMARY
 from .jobs import Job, State
 from .limits import Refused
@@ -66,7 +66,7 @@ def _answer_refused(request: Request, error: Exception) -> JSONResponse:
 
 
 def _answer_input_error(request: Request, error: Exception) -> JSONResponse:
-    return JSONResponse({"detail": " ".join(str(error).split())}, BAD_INPUT)
+    return JSONResponse({"detail": one_line(error)}, BAD_INPUT)
 
 
 def _answer_nobody(request: Request, error: Exception) -> JSONResponse:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from ...runtime.errors import one_line
 from ...runtime.system.memory import peak_bytes
 from ..processes import safe_path
 
@@ -114,7 +115,7 @@ def _serve(pipe: Connection, prepare: Callable[..., Prepared], arguments: tuple)
     except EOFError:  # the measuring process is gone
         pass
     except Exception as error:
-        pipe.send(Failed(" ".join(str(error).split()) or type(error).__name__))
+        pipe.send(Failed(one_line(error)))
 
 
 # ---- candidates: what `about` holds, and what is run

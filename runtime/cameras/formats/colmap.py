@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...errors import InputError, error_context
+from ...errors import InputError, error_context, one_line
 from ...geometry.depth_bounds import depth_bounds
 from ...geometry.intrinsics import intrinsic_matrix
 from ...geometry.rigid import invert_rigid
@@ -232,4 +232,4 @@ if __name__ == "__main__":
 
         print(json.dumps(describe(pycolmap.Reconstruction(sys.argv[1]))))
     except Exception as error:  # pycolmap raises many types for damaged models
-        sys.exit(" ".join(str(error).split()))
+        sys.exit(one_line(error))

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import InputError, error_context
+from ...errors import InputError, error_context, one_line
 from ...geometry.intrinsics import from_opencv_pixels
 from ...geometry.rigid import invert_rigid
 from ...images.header import image_size
@@ -82,8 +82,7 @@ def _fields(path: Path) -> dict[str, Any]:
         root = storage.root()
         return {name: _value(root.getNode(name)) for name in list(root.keys())}
     except (cv2.error, SystemError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"OpenCV cannot read this calibration ({reason}); is it damaged?") from None
+        raise InputError(f"OpenCV cannot read this calibration ({one_line(error)}); is it damaged?") from None
 
 
 def _value(node: Any) -> Any:
