@@ -2,12 +2,9 @@
 
 import json
 import multiprocessing
-import os
 import shutil
-import signal
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -16,6 +13,7 @@ import pytest
 from conftest import run_command
 from idesplat.runtime.cli import batch
 from idesplat.runtime.system.files import SCRATCH_PREFIX
+from killed_workers import killing_workers
 from scene_files import snapshot
 from tiny_model import write_model
 
@@ -90,31 +88,9 @@ def test_again_does_what_is_missing_or_changed_and_nothing_else(given, undisturb
 
 
 def test_the_scene_of_a_killed_worker_is_done_again_and_fails_the_second_time(given, undisturbed, tmp_path):
-    out, killed, ended = tmp_path / "out", [], threading.Event()
-
-    def kill() -> None:
-        """Kill the worker when it begins b for the first time, and whenever it begins c."""
-        seen = set()
-        while not ended.wait(POLL_S):
-            for name in ("c",) if "b" in killed else ("b", "c"):
-                record = out / name / "record.json"
-                try:
-                    begun = record.stat().st_mtime_ns
-                    if begun in seen or json.loads(record.read_text())["status"] != "started":
-                        continue
-                except FileNotFoundError:
-                    continue
-                seen.add(begun)
-                killed.append(name)
-                os.kill(multiprocessing.active_children()[0].pid, signal.SIGKILL)
-
-    killer = threading.Thread(target=kill)
-    killer.start()
-    try:
+    out = tmp_path / "out"
+    with killing_workers(out, lambda: [multiprocessing.active_children()[0].pid]) as killed:
         summary = idesplat.batch(given[0], out, model=given[1])
-    finally:
-        ended.set()
-        killer.join()
     assert killed == ["b", "c", "c"]
     assert (summary.done, sorted(summary.failures)) == (3, ["c", "empty"])
     record = json.loads((out / "c" / "record.json").read_text())

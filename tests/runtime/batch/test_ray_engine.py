@@ -3,8 +3,6 @@
 import json
 import os
 import shutil
-import signal
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,10 +12,10 @@ from conftest import run_command
 from idesplat.runtime.batch.ray_engine import _connected
 from idesplat.runtime.batch.run import Engine
 from idesplat.runtime.cli import batch
+from killed_workers import killing_workers
 from tiny_model import NETWORK, write_model
 
 NAMES = ("a", "b", "c")
-POLL_S = 0.002
 LOOPBACK = ("0100007F", "0000000000000000FFFF00000100007F", "00000000000000000000000001000000")
 LISTENING = "0A"
 
@@ -70,32 +68,9 @@ def test_results_are_those_of_the_local_engine_and_ray_prints_nothing(given, und
 
 
 def test_the_scene_of_a_killed_actor_is_done_again_and_fails_the_second_time(given, undisturbed, tmp_path):
-    out, killed, ended = tmp_path / "out", [], threading.Event()
-
-    def kill() -> None:
-        """Kill the actor when it begins b for the first time, and whenever it begins c."""
-        seen = set()
-        while not ended.wait(POLL_S):
-            for name in ("c",) if "b" in killed else ("b", "c"):
-                record = out / name / "record.json"
-                try:
-                    begun = record.stat().st_mtime_ns
-                    if begun in seen or json.loads(record.read_text())["status"] != "started":
-                        continue
-                except FileNotFoundError:
-                    continue
-                seen.add(begun)
-                killed.append(name)
-                for process in descendants("ray::_Actor"):
-                    os.kill(process, signal.SIGKILL)
-
-    killer = threading.Thread(target=kill)
-    killer.start()
-    try:
+    out = tmp_path / "out"
+    with killing_workers(out, lambda: descendants("ray::_Actor")) as killed:
         summary = idesplat.batch(given[0], out, model=given[1], engine=Engine.RAY)
-    finally:
-        ended.set()
-        killer.join()
     assert killed == ["b", "c", "c"]
     assert (summary.done, sorted(summary.failures)) == (2, ["c", "empty"])
     assert "killed twice" in json.loads((out / "c" / "record.json").read_text())["error"]
