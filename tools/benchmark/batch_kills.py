@@ -20,6 +20,7 @@ import typer
 
 from ...runtime.cli.outputs import command
 from ...runtime.cli.terminal import run, say
+from ..processes import descendants
 
 VICTIMS = ("driver", "actor", "raylet")
 SIGNALS = (signal.SIGKILL, signal.SIGTERM)
@@ -110,18 +111,8 @@ def _disturb(driver: subprocess.Popen[bytes], rng: random.Random, tell: Callable
 
 def _children(driver: int, victim: str) -> Iterator[int]:
     """The processes below the driver that are an actor or the raylet."""
-    parents, titles = {}, {}
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            parents[int(folder.name)] = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
-            titles[int(folder.name)] = (folder / "cmdline").read_bytes().decode(errors="replace")
-        except (FileNotFoundError, ProcessLookupError):
-            continue
-    below = {driver}
-    while more := {process for process, parent in parents.items() if parent in below} - below:
-        below |= more
-    for process in below - {driver}:
-        if titles[process].startswith(ACTOR) if victim == "actor" else RAYLET in titles[process].partition("\0")[0]:
+    for process, words in descendants(driver).items():
+        if words.startswith(ACTOR) if victim == "actor" else RAYLET in words.partition("\0")[0]:
             yield process
 
 

@@ -12,6 +12,7 @@ from conftest import run_command
 from idesplat.runtime.batch.ray_engine import _connected
 from idesplat.runtime.batch.run import Engine
 from idesplat.runtime.cli import batch
+from idesplat.tools.processes import descendants
 from killed_workers import killing_workers
 from tiny_model import NETWORK, write_model
 
@@ -67,9 +68,13 @@ def test_results_are_those_of_the_local_engine_and_ray_prints_nothing(given, und
     assert capfd.readouterr() == ("", "")
 
 
+def actors() -> list[int]:
+    return [process for process, words in descendants(os.getpid()).items() if words.startswith("ray::_Actor")]
+
+
 def test_the_scene_of_a_killed_actor_is_done_again_and_fails_the_second_time(given, undisturbed, tmp_path):
     out = tmp_path / "out"
-    with killing_workers(out, lambda: descendants("ray::_Actor")) as killed:
+    with killing_workers(out, actors) as killed:
         summary = idesplat.batch(given[0], out, model=given[1], engine=Engine.RAY)
     assert killed == ["b", "c", "c"]
     assert (summary.done, sorted(summary.failures)) == (2, ["c", "empty"])
@@ -85,7 +90,7 @@ def test_a_model_that_cannot_be_opened_ends_the_run(given, tmp_path):
 
 
 def test_ray_listens_on_the_loopback_address_alone():
-    own = {link for process in descendants("") for link in open_files(process)}
+    own = {link for process in descendants(os.getpid()) for link in open_files(process)}
     listening = []
     for table in (Path("/proc/net/tcp"), Path("/proc/net/tcp6")):
         for line in table.read_text().splitlines()[1:]:
@@ -94,21 +99,6 @@ def test_ray_listens_on_the_loopback_address_alone():
                 listening.append(fields[1].partition(":")[0])
     assert listening
     assert set(listening) <= set(LOOPBACK)
-
-
-def descendants(title: str) -> list[int]:
-    """The processes that this one started, and theirs, whose command line begins so."""
-    parents, titles = {}, {}
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            parents[int(folder.name)] = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
-            titles[int(folder.name)] = (folder / "cmdline").read_bytes().decode(errors="replace")
-        except (FileNotFoundError, ProcessLookupError):
-            continue
-    found = {os.getpid()}
-    while more := {process for process, parent in parents.items() if parent in found} - found:
-        found |= more
-    return [process for process in found - {os.getpid()} if titles[process].startswith(title)]
 
 
 def open_files(process: int) -> list[str]:
