@@ -45,7 +45,7 @@ def run_on_ray(
     iterator lives. A program that has called `ray.init` itself stays connected as it is.
     Raises InputError if Ray is not installed or not reached, the model cannot be opened, or actors end as they start.
     """
-    with _connected(address, workers * threads) as ray:
+    with connected(address, workers * threads) as ray:
         yield from _Pool(ray, threads, settings).run(iter(scenes), workers)
 
 
@@ -135,10 +135,11 @@ class _Pool:
 
 
 @contextmanager
-def _connected(address: str | None, cpus: int) -> Iterator[ModuleType]:
-    """Ray, connected to a cluster or started here.
+def connected(address: str | None, cpus: int) -> Iterator[ModuleType]:
+    """Ray, connected to a cluster or started here, for the block; raises InputError as `run_on_ray`.
 
-    Started here, it listens on the loopback address alone, unless the program had imported Ray before.
+    Started here, it has so many CPUs, and listens on the loopback address alone, unless the program had imported Ray
+    before.
     """
     os.environ.update(QUIET)
     if address is None:

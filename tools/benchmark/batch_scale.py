@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import typer
 
 from ...runtime.batch.index import Index
-from ...runtime.batch.ray_engine import _connected
+from ...runtime.batch.ray_engine import connected
 from ...runtime.batch.run import Summary
 from ...runtime.batch.scenes import read_scenes
 from ...runtime.batch.worker import Outcome
@@ -80,7 +80,7 @@ def hand_out(in_flight: int, record: dict[str, Any]) -> dict[str, float]:
         def run(self, scene: str) -> Outcome:
             return Outcome({**record, "id": scene}, True)
 
-    with _connected(None, 1) as ray:
+    with connected(None, 1) as ray:
         actor = ray.remote(Nothing).remote()
         ray.get(actor.run.remote(""))
         running = {actor.run.remote("scene"): None for _ in range(in_flight)}

@@ -9,7 +9,7 @@ from pathlib import Path
 import idesplat
 import pytest
 from conftest import run_command
-from idesplat.runtime.batch.ray_engine import _connected
+from idesplat.runtime.batch.ray_engine import connected
 from idesplat.runtime.batch.run import Engine
 from idesplat.runtime.cli import batch
 from idesplat.tools.processes import descendants
@@ -39,7 +39,7 @@ def given(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, 
 @pytest.fixture(scope="module", autouse=True)
 def ray() -> Iterator[object]:
     """Ray as the command starts it, with two CPUs."""
-    with _connected(None, 2) as started:
+    with connected(None, 2) as started:
         yield started
 
 
