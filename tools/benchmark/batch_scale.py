@@ -97,13 +97,14 @@ def cluster(found: dict[str, Any], record: dict[str, Any]) -> dict[str, Any]:
     """What the cluster takes, from the measured numbers. A worker is one core."""
     scenes, seconds = found["scenes"], record["seconds"]
     results = sum(described["bytes"] for described in record["files"].values())
+    message = len(pickle.dumps(Outcome(record, True)))
     hours = scenes * seconds / found["workers"] / HOUR
     return {
         "seconds_per_scene": seconds,
         "hours": hours,
         "scenes_per_second": found["workers"] / seconds,
-        "bytes_through_ray_per_scene": len(pickle.dumps(Outcome(record, True))),
-        "gb_through_ray": scenes * len(pickle.dumps(Outcome(record, True))) / GB,
+        "bytes_through_ray_per_scene": message,
+        "gb_through_ray": scenes * message / GB,
         "result_mb_per_scene": results / MB,
         "result_tb": scenes * results / MB / MB,
         "result_gb_per_second": found["workers"] / seconds * results / GB,
