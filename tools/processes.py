@@ -30,10 +30,11 @@ def descendants(process: int) -> dict[int, str]:
     parents, commands = {}, {}
     for folder in Path("/proc").glob("[0-9]*"):
         try:
-            parents[int(folder.name)] = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
-            commands[int(folder.name)] = (folder / "cmdline").read_bytes().decode(errors="replace")
+            parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+            command = (folder / "cmdline").read_bytes().decode(errors="replace")
         except (FileNotFoundError, ProcessLookupError):
             continue
+        parents[int(folder.name)], commands[int(folder.name)] = parent, command
     below = {process}
     while more := {child for child, parent in parents.items() if parent in below} - below:
         below |= more
