@@ -136,10 +136,10 @@ class _Pool:
 
 @contextmanager
 def connected(address: str | None, cpus: int) -> Iterator[ModuleType]:
-    """Ray, connected to a cluster or started here, for the block; raises InputError as `run_on_ray`.
+    """Ray, connected to a cluster or started here, for the block.
 
     Started here, it has so many CPUs, and listens on the loopback address alone, unless the program had imported Ray
-    before.
+    before. Raises InputError if Ray is not installed, does not start or is not reached.
     """
     os.environ.update(QUIET)
     if address is None:
