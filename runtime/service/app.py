@@ -14,6 +14,7 @@ from starlette.types import ASGIApp
 
 from ..errors import InputError, one_line
 from ..system.output_names import CAMERAS_FILE, SUMMARY
+from ..web.site import PAGE as WEB_PAGE
 from .jobs import Job, State
 from .limits import Refused
 from .protection import Protection
@@ -22,6 +23,7 @@ from .service import Service
 from .worker import DEPTH, RENDERS
 
 PAGE = Path(__file__).with_name("page")
+BASE_STYLE = WEB_PAGE / "base.css"  # which the page shares with that of `idesplat web`
 HEARTBEAT_S = 15.0  # between events of a job that does not change, so that proxies keep the connection
 BAD_INPUT = 422
 PROBLEMS: dict[int | str, dict[str, Any]] = {
@@ -145,6 +147,10 @@ def _add_probes(app: FastAPI, service: Service) -> None:
     @app.get("/", include_in_schema=False)
     async def page() -> FileResponse:
         return FileResponse(PAGE / "index.html")
+
+    @app.get("/page/base.css", include_in_schema=False)
+    async def base_style() -> FileResponse:
+        return FileResponse(BASE_STYLE)
 
 
 async def _events(service: Service, job: Job) -> AsyncIterator[str]:
