@@ -29,12 +29,13 @@ from .targets import MAX_TRACED_OPSET, OPSET, WEB, GraphSettings
 # Of opset 20 and later; earlier opsets, which are for older runtimes, have the least that fits them.
 IR_VERSION = 10
 DEFAULT_SETTINGS = GraphSettings()
-# Numbers of views and blocks that differ from every constant in the network; the graph is dynamic in all of them.
-TRACE_VIEWS = 4
-TRACE_BLOCKS = (6, 8)
-# Of the inputs that tell the ranks and constant dimensions of the tensors: few, to save time.
-SMALL_VIEWS = 2
-SMALL_BLOCKS = (2, 3)
+# Numbers of views and blocks of the inputs that are traced, as few as a network takes, to save time: more give the
+# same graph, byte for byte. The graph runs at any.
+TRACE_VIEWS = 2
+TRACE_BLOCKS = (2, 3)
+# Of the inputs from which ranges for int8 are taken.
+RANGE_VIEWS = 4
+RANGE_BLOCKS = (6, 8)
 DYNAMIC = {
     "images": {0: "views", 2: "height", 3: "width"},
     "extrinsics": {0: "views"},
@@ -153,10 +154,10 @@ def _fold(model: onnx.ModelProto, known: SymbolicShapes, dims: _Dimensions) -> N
 
 def _examples(metadata: ModelMetadata, static: StaticShape) -> Iterator[Feeds]:
     """Calibration inputs: noise and a synthetic room, in portrait and landscape format."""
-    across = tuple(blocks * metadata.size_multiple for blocks in TRACE_BLOCKS)
+    across = tuple(blocks * metadata.size_multiple for blocks in RANGE_BLOCKS)
     for height, width in [static.size] if static.size else [across, across[::-1]]:
         for make in (example_inputs, room_inputs):
-            inputs = make(static.views or TRACE_VIEWS, height, width, metadata.near, metadata.far)
+            inputs = make(static.views or RANGE_VIEWS, height, width, metadata.near, metadata.far)
             yield {name: tensor.numpy() for name, tensor in inputs.items()}
 
 
@@ -169,13 +170,12 @@ def trace(
     minutes on symbolic shapes, even for a network of a tenth of the size. The exporter is not given the weights, of
     which it would hold several copies.
     """
-    inputs = _noise(metadata, static, TRACE_VIEWS, TRACE_BLOCKS)
-    small = _noise(metadata, static, SMALL_VIEWS, SMALL_BLOCKS)
+    inputs = _noise(metadata, static)
     path, weights = folder / TRACED, folder / TRACED_WEIGHTS
     with warnings.catch_warnings(), torch.no_grad(), chunked(network):
         warnings.simplefilter("ignore")  # the exporter's deprecation, and tracing warnings about static dimensions
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-        shapes = {name: tuple(tensor.shape) for name, tensor in network.named(*small).items()}
+        shapes = {name: tuple(tensor.shape) for name, tensor in network.named(*inputs).items()}
         axes = _dynamic_axes(shapes, static)
         torch.onnx.export(
             network,
@@ -198,12 +198,10 @@ def trace(
     return model
 
 
-def _noise(
-    metadata: ModelMetadata, static: StaticShape, views: int, blocks: tuple[int, int]
-) -> tuple[torch.Tensor, ...]:
-    """Inputs of noise, of this many views and blocks where the graph's dimensions are dynamic."""
-    height, width = static.size or (blocks[0] * metadata.size_multiple, blocks[1] * metadata.size_multiple)
-    return tuple(example_inputs(static.views or views, height, width, metadata.near, metadata.far).values())
+def _noise(metadata: ModelMetadata, static: StaticShape) -> tuple[torch.Tensor, ...]:
+    """Inputs of noise, small where the graph's dimensions are dynamic."""
+    height, width = static.size or (blocks * metadata.size_multiple for blocks in TRACE_BLOCKS)
+    return tuple(example_inputs(static.views or TRACE_VIEWS, height, width, metadata.near, metadata.far).values())
 
 
 def _dynamic_axes(shapes: dict[str, tuple[int, ...]], static: StaticShape) -> dict[str, dict[int, str]]:
