@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 KEEP := MALLOC_MMAP_THRESHOLD_=4294967296 MALLOC_TRIM_THRESHOLD_=4294967296
 PYTEST := OMP_NUM_THREADS=1 $(KEEP) $(BIN)/python -m pytest --quiet -n 2 --dist loadfile --no-loadscope-reorder
 
-.PHONY: setup test webgpu quick check docs demo web weights clean
+.PHONY: setup test pytest webgpu quick check docs demo web weights clean
 
 setup: $(VENV)/.ready
 
@@ -23,8 +23,12 @@ $(VENV)/.ready: pyproject.toml constraints.txt tests/npm/package-lock.json
 	for part in *.py py.typed model export runtime tools; do ln -sfn ../../$$part .typing/idesplat/$$part; done
 	touch $@
 
-# Lint, types and every test but that of `make webgpu`.
-test: check
+# Lint, types and every test but that of `make webgpu`. Types are checked beside the tests, which do not keep two cores
+# busy all the time.
+test: setup
+	$(MAKE) --no-print-directory --jobs 2 check pytest
+
+pytest: setup
 	$(PYTEST) -m "not webgpu"
 
 # A whole network on a WebGPU adapter in software: four minutes.

@@ -157,12 +157,17 @@ def kept_traces(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def exported(small_checkpoint, presets, kept_traces, tmp_path_factory) -> tuple[Path, Path]:
-    """The small network as a fused file and as a staged folder, through the command."""
+    """The small network as a fused file and as a staged folder, through the command, verified with one case.
+
+    tests/export/validation/test_verification.py compares all cases.
+    """
     from idesplat.export.cli import main
+    from kept_traces import one_verification_case
 
     def export(folder: Path) -> None:
         arguments = (small_checkpoint, folder / "model.onnx", "--staged", folder / "staged")
-        assert run_command(main, *arguments) == 0
+        with one_verification_case():
+            assert run_command(main, *arguments) == 0
 
     folder = build_once(tmp_path_factory, "exported", export)
     return folder / "model.onnx", folder / "staged"

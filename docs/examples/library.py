@@ -16,7 +16,7 @@ def main() -> None:
     photos, out = Path(sys.argv[1]), Path(sys.argv[2])
     out.mkdir(parents=True, exist_ok=True)
 
-    reconstruction = idesplat.reconstruct(photos, views=2)
+    reconstruction = idesplat.reconstruct(photos, views=2, quality="fast")  # the default quality takes longer
     gaussians = reconstruction.gaussians  # means, quats, scales, opacities, sh
     print(f"{len(gaussians.means)} Gaussians, depth maps {reconstruction.depth.shape}")
     idesplat.write_splats(out / "scene.ply", gaussians)

@@ -46,14 +46,14 @@ def network(name):
 
 @pytest.fixture(scope="module")
 def graphs(kept_traces, tmp_path_factory):
-    """Each network through the command: name -> fused file and staged folder."""
+    """Each network through the command: name -> fused file and staged folder; the tests compare them with PyTorch."""
     PRESETS.update(NETWORKS)
     folder = tmp_path_factory.mktemp("depthsplat")
     found = {}
     for name in NETWORKS:
         checkpoint, out, staged = folder / f"{name}.pth", folder / f"{name}.onnx", folder / name
         torch.save(network(name).state_dict(), checkpoint)
-        assert run_command(export, checkpoint, out, "--staged", staged) == 0
+        assert run_command(export, checkpoint, out, "--staged", staged, "--no-verify") == 0
         found[name] = out, staged
     yield found
     for name in NETWORKS:

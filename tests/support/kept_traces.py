@@ -1,8 +1,10 @@
-"""Traced networks, kept for further exports of the same network: tracing takes most of an export's time."""
+"""Exports in less time: traces that are kept for further exports of the same network, and fewer verification cases."""
 
 import hashlib
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 
 import onnx
@@ -11,6 +13,8 @@ from idesplat.export import tracing
 from idesplat.export.stages import NamedTensors
 from idesplat.export.targets import OPSET
 from idesplat.export.tracing import WEIGHTS, StaticShape
+from idesplat.export.validation import compare
+from idesplat.export.validation.cases import verification_cases
 from idesplat.runtime.inference.metadata import ModelMetadata
 from shared_fixtures import build_once
 
@@ -38,3 +42,11 @@ def keeping_trace(factory: pytest.TempPathFactory) -> Callable[..., onnx.ModelPr
         return onnx.load(made / GRAPH, load_external_data=False)
 
     return kept
+
+
+@contextmanager
+def one_verification_case() -> Iterator[None]:
+    """Inside, an export is verified with the first of its cases alone."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compare, "verification_cases", lambda *given: islice(verification_cases(*given), 1))
+        yield

@@ -10,6 +10,7 @@ from idesplat import Predictor
 from idesplat.export import cli
 from idesplat.export.example_inputs import example_inputs
 from idesplat.runtime.inference.metadata import INPUTS, OUTPUTS
+from kept_traces import one_verification_case
 from onnx import TensorProto
 
 # Kept in float32: the geometry, monocular depth, gather attention, the focus module and the last
@@ -26,7 +27,8 @@ def lowered(request, small_checkpoint, presets, kept_traces, tmp_path_factory):
     arguments = (small_checkpoint, out, "--staged", staged, "--precision", request.param)
     if request.param == "int8":
         arguments += ("--no-verify",)  # it takes a minute; the graphs are compared below
-    assert run_command(cli.main, *arguments) == 0
+    with one_verification_case():
+        assert run_command(cli.main, *arguments) == 0
     return request.param, out, staged
 
 

@@ -39,6 +39,7 @@ from idesplat.tools.training.settings import TrainingSettings
 from idesplat.tools.training.state import TrainingState
 from idesplat.tools.training.step import scene_loss, with_input_view
 from idesplat.tools.training.trainer import Trainer
+from shared_fixtures import build_once
 
 SMALL = IDESplatConfig(
     backbone_channels=(8, 8, 16),
@@ -224,10 +225,11 @@ def logged(folder: Path) -> list[dict[str, float]]:
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("finished")
-    torch.set_num_threads(1)
-    Trainer(folder, SETTINGS, SMALL).fit(save_every=1e9, validate_every=4)
-    return folder
+    def run(folder: Path) -> None:
+        torch.set_num_threads(1)
+        Trainer(folder, SETTINGS, SMALL).fit(save_every=1e9, validate_every=4)
+
+    return build_once(tmp_path_factory, "finished-training", run)
 
 
 def test_run_writes_log_curves_and_predictions(finished: Path) -> None:
