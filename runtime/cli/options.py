@@ -55,15 +55,15 @@ Model = Annotated[
 ]
 EXECUTION = "Where the model runs"
 MAX_THREADS = 1024
-Provider = Annotated[
-    str,
-    typer.Option(
-        help="Execution provider of ONNX Runtime (`idesplat bench --list-providers`), or auto: a GPU where one works, "
-        "else the CPU.",
-        metavar="auto|NAME",
-        rich_help_panel=EXECUTION,
-    ),
-]
+PROVIDER = typer.Option(
+    help="Execution provider of ONNX Runtime (`idesplat bench --list-providers`), or auto: a GPU where one works, "
+    "else the CPU.",
+    metavar="auto|NAME",
+    rich_help_panel=EXECUTION,
+)
+Provider = Annotated[str, PROVIDER]
+# One or several, to compare them.
+Providers = Annotated[list[str] | None, PROVIDER]
 ProviderOption = Annotated[
     list[str] | None,
     typer.Option(

@@ -76,10 +76,10 @@ def test_its_own_number_is_used(arguments: tuple[str, ...]) -> None:
         (("--views", "4"), "--views 4: model.onnx was exported for 3 views; use --views 3"),
         (("--views", "2"), "--views 2: model.onnx was exported for 3 views; use --views 3"),
         (
-            ("--context", "000", "--context", "001", "--target", "002"),
+            ("--context", "000", "--context", "001", "--hold-out", "002"),
             "model.onnx was exported for 3 views and got 2; give 3",
         ),
-        (("--context", "000", "--context", "001", "--views", "2", "--target", "002"), "--views and --context"),
+        (("--context", "000", "--context", "001", "--views", "2", "--hold-out", "002"), "--views and --context"),
     ),
 )
 def test_evaluation_keeps_to_it(arguments: tuple[str, ...], expected: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -88,6 +88,6 @@ def test_evaluation_keeps_to_it(arguments: tuple[str, ...], expected: str, capsy
 
 
 def test_evaluation_uses_it() -> None:
-    assert run_command(evaluate, "scene", "images", *USUAL, "--out", "out", "--target", "002") == 0
+    assert run_command(evaluate, "scene", "images", *USUAL, "--out", "out", "--hold-out", "002") == 0
     (scene,) = json.loads(Path("out/results.json").read_text())["scenes"]
     assert len(scene["context"]) == 3

@@ -114,7 +114,7 @@ COMMANDS = {
         evaluate.scene,
         evaluate.main,
         f"scene images --cameras transforms.json --out out {MODEL} --size 32x48 --context 000 --context 001 "
-        "--target 002 --true-depth depth",
+        "--hold-out 002 --true-depth depth",
         (*POSED, "model.onnx", "depth/000.npz"),
         15,
     ),

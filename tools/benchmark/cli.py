@@ -20,6 +20,7 @@ from ...runtime.cli.options import (
     Json,
     Overwrite,
     ProviderOption,
+    Providers,
     Quiet,
     Threads,
     Verbose,
@@ -50,15 +51,7 @@ def bench(
     sizes: Annotated[
         str | None, typer.Option(help="Sizes, such as 256x256,256x448, instead of each model's own.")
     ] = None,
-    provider: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Execution provider, or auto, as for `idesplat infer`; repeat it to compare several. CPU by default.",
-            metavar="auto|NAME",
-            show_default=False,
-            rich_help_panel=EXECUTION,
-        ),
-    ] = None,
+    provider: Providers = None,
     provider_option: ProviderOption = None,
     device: Device = None,
     threads: Threads = None,
@@ -84,7 +77,10 @@ def bench(
     verbose: Verbose = 0,
     quiet: Quiet = False,
 ) -> None:
-    """Measure time and memory of exported models, each in a fresh process; Ctrl-C keeps finished workloads."""
+    """Measure time and memory of exported models, each in a fresh process; Ctrl-C keeps finished workloads.
+
+    --provider may be repeated to compare several; CPU by default.
+    """
     if list_providers:
         from .report import print_providers
 

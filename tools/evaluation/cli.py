@@ -61,12 +61,12 @@ def scene(
     device: Device = None,
     threads: Threads = None,
     context: Annotated[list[str] | None, typer.Option(help="An image to infer from; give two or more.")] = None,
-    target: Annotated[list[str] | None, typer.Option(help="An image to hold out; give one or more.")] = None,
+    hold_out: Annotated[list[str] | None, typer.Option(help="An image to hold out; give one or more.")] = None,
     views: Annotated[
         int | None, typer.Option(help="Images around each target, without --context; 2 by default.", min=2)
     ] = None,
     hold_out_every: Annotated[
-        int, typer.Option(help="Hold out images 0, N, 2 N and on, without --target.", min=2)
+        int, typer.Option(help="Hold out images 0, N, 2 N and on, without --hold-out.", min=2)
     ] = HOLD_OUT_EVERY,
     true_depth: Annotated[Path | None, typer.Option(help="Folder of true depth, as make_scene writes it.")] = None,
     size: Size = None,
@@ -94,7 +94,7 @@ def scene(
         known,
         ModelOn(find_model(model), provider, session),
         context=context or [],
-        targets=target or [],
+        targets=hold_out or [],
         views=views,
         hold_out_every=hold_out_every,
         depth=true_depth,

@@ -42,12 +42,12 @@ def split_frames(
     Raises InputError for names of no frame or of several, for names given twice, and for too few frames.
     """
     given = [_number(frames, name, "--context") for name in context]
-    held_out = [_number(frames, name, "--target") for name in targets]
+    held_out = [_number(frames, name, "--hold-out") for name in targets]
     for number in {*given, *held_out}:
         if [*given, *held_out].count(number) > 1:
             raise InputError(f"{frames[number][0].name} is named twice, expected each frame once, as context or target")
     if given and not held_out:
-        raise InputError("--context without --target; name the frames to compare with")
+        raise InputError("--context without --hold-out; name the frames to compare with")
     if given:
         if len(given) < 2:
             raise InputError(f"--context names {len(given)} frame, expected at least 2")

@@ -60,7 +60,7 @@ Capture = pytest.CaptureFixture[str]
 SCENE = ("scene", "images", "--cameras", "transforms.json", "--model", "model.onnx", "--out", "out")
 CHUNKS = ("chunks", "chunks", "--index", "index.json", "--model", "model.onnx", "--out", "out")
 SYNTHETIC = ("synthetic", "--model", "model.onnx", "--out", "out", "--scenes", "1")
-NAMED = ("--context", "000", "--context", "004", "--target", "001", "--target", "002")
+NAMED = ("--context", "000", "--context", "004", "--hold-out", "001", "--hold-out", "002")
 
 
 def results() -> dict[str, Any]:
@@ -255,9 +255,9 @@ def cameras_at_one_place() -> None:
 
 
 BAD = {
-    "an unknown frame": (nothing, (*SCENE, *NAMED, "--target", "0099"), "--target 0099"),
-    "a frame that is context and target": (nothing, (*SCENE, *NAMED, "--target", "000"), "000.png is named twice"),
-    "one frame of context": (nothing, (*SCENE, "--context", "000", "--target", "001"), "expected at least 2"),
+    "an unknown frame": (nothing, (*SCENE, *NAMED, "--hold-out", "0099"), "--hold-out 0099"),
+    "a frame that is context and target": (nothing, (*SCENE, *NAMED, "--hold-out", "000"), "000.png is named twice"),
+    "one frame of context": (nothing, (*SCENE, "--context", "000", "--hold-out", "001"), "expected at least 2"),
     "more views than images": (nothing, (*SCENE, "--views", "5"), "too few are left"),
     "no images": (nothing, ("scene", "nowhere", *SCENE[2:]), "nowhere"),
     "no cameras": (nothing, (*SCENE, "--cameras", "none.json"), "none.json"),

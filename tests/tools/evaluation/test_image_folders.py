@@ -70,10 +70,10 @@ def test_context_lies_around_the_target() -> None:
     ("context", "targets", "views", "expected"),
     [
         (["0006", "0099"], ["0007"], 2, "--context 0099: the name of none of 9 images"),
-        (["0006", "0008"], ["7"], 2, "--target 7: the name of none"),
+        (["0006", "0008"], ["7"], 2, "--hold-out 7: the name of none"),
         (["0006", "0008"], ["0006"], 2, "0006.jpg is named twice"),
         (["0006", "0006"], ["0007"], 2, "0006.jpg is named twice"),
-        (["0006", "0008"], [], 2, "--context without --target"),
+        (["0006", "0008"], [], 2, "--context without --hold-out"),
         (["0006"], ["0007"], 2, "expected at least 2"),
         ([], ["0007"], 9, "too few are left for a context of 9"),
         ([], [], 9, "too few are left for a context of 9"),
