@@ -78,6 +78,7 @@ export class Network {
       const problem = provider === "webgpu" ? await webgpuProblem(model, asked !== null) : null;
       if (problem) {
         if (asked) throw new InputError(`${problem}; choose WebAssembly`);
+        note(`${problem}; WebAssembly is used`);
         continue;
       }
       try {

@@ -9,7 +9,7 @@ const STEP = 0.05; // radians, and share of the distance, of a key
 const SWING = 0.2; // radians to each side
 const SWING_S = 6;
 const MAX_PIXEL_RATIO = 2;
-const DRAWN_S = 3; // after a change: the splats are sorted in the background
+const DRAWN_S = 1; // after a change, of which the end of a sort in the background is one
 
 /** Shows one scene. `dispose` frees the graphics memory. */
 export class Viewer {
@@ -19,7 +19,9 @@ export class Viewer {
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, preserveDrawingBuffer: true });
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, MAX_PIXEL_RATIO));
     this.scene = new THREE.Scene();
-    this.scene.add(new SparkRenderer({ renderer: this.renderer }));
+    // Sorted by z-depth, as our rasteriser and those that splats are trained with, not by distance.
+    const spark = new SparkRenderer({ renderer: this.renderer, sortRadial: false, onDirty: () => this.touch() });
+    this.scene.add(spark);
     this.camera = new THREE.PerspectiveCamera(60, 1, 0.01, 1000);
     this.pivot = new THREE.Group();
     this.scene.add(this.pivot);
