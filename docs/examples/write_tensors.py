@@ -4,7 +4,8 @@
 
 SCENE holds a transforms.json (OpenGL camera-to-world poses, no lens distortion) and its images. near and far are the
 depth range of the scene in the unit of its poses. OUT receives images.f32, extrinsics.f32, intrinsics.f32, near.f32
-and far.f32 (little endian, row-major) and frame.json, which leads the results back into the scene's frame and unit.
+and far.f32 (little endian, row-major), and frame.json and frame.f32 (scale, origin), which lead the results back into
+the scene's frame and unit.
 """
 
 import argparse
@@ -68,6 +69,7 @@ def main() -> None:
     arguments.out.mkdir(parents=True, exist_ok=True)
     for name, values in tensors.items():
         values.astype("<f4").tofile(arguments.out / f"{name}.f32")
+    np.array([scale, *origin], "<f4").tofile(arguments.out / "frame.f32")
     frame = {"views": len(frames), "height": height, "width": width, "origin": origin.tolist(), "scale": scale}
     (arguments.out / "frame.json").write_text(json.dumps(frame, indent=1) + "\n")
 

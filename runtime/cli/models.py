@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
 WIDTH = 150  # columns, if the output is not a terminal
 BUNDLED_STATE, CACHED, KNOWN = "bundled", "cached", "known"
+BUNDLED_MILLIONS = 3.1  # parameters, which the metadata does not tell
 
 
 @command("idesplat models")
@@ -55,7 +56,7 @@ def _bundled() -> dict[str, Any]:
     return {
         "name": BUNDLED,
         "family": "IDESplat",
-        "parameters_million": 3.0,
+        "parameters_million": BUNDLED_MILLIONS,
         "size": [own.height, own.width],
         "views": own.trained_views,
         "gaussians": own.gaussians,

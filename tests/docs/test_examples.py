@@ -112,3 +112,24 @@ def test_cpp(tensors: Path, tmp_path: Path) -> None:
     run(program, MODEL, folder, *NUMBERS)
     for name in OUTPUTS:
         np.testing.assert_allclose(read(folder, name), read(tensors, name), rtol=1e-3, atol=1e-3, err_msg=name)
+    check_splats(folder)
+
+
+def check_splats(folder: Path) -> None:
+    """The example's .ply is the one that the library writes of the same Gaussians."""
+    import idesplat
+
+    scale, *origin = read(folder, "frame")
+    values = {name: read(folder, name) for name in OUTPUTS[1:]}
+    count = len(values["opacities"])
+    expected = idesplat.Gaussians(
+        means=values["means"].reshape(count, 3) / scale + np.array(origin, np.float32),
+        scales=values["scales"].reshape(count, 3) / scale,
+        quats=values["quats"].reshape(count, 4),
+        opacities=values["opacities"],
+        sh=values["sh"].reshape(count, -1, 3),
+    )
+    idesplat.write_splats(folder / "expected.ply", expected)
+    ours, theirs = ((folder / name).read_bytes().split(b"end_header\n", 1) for name in ("expected.ply", "scene.ply"))
+    assert theirs[0] == ours[0]
+    np.testing.assert_allclose(np.frombuffer(theirs[1], "<f4"), np.frombuffer(ours[1], "<f4"), rtol=1e-5, atol=1e-6)

@@ -8,6 +8,7 @@ import torch
 from conftest import run_command
 from idesplat.model.registry import PRESETS, build
 from idesplat.runtime.cli import infer
+from idesplat.runtime.cli.models import BUNDLED_MILLIONS
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.inference.bundled_model import bundled_model
 from idesplat.runtime.inference.known_models import KNOWN_MODELS
@@ -19,12 +20,19 @@ from idesplat.runtime.inference.named_models import cached_path, find_model
 def test_the_table_agrees_with_the_preset(name):
     model, config = KNOWN_MODELS[name], PRESETS[name]
     assert (model.height, model.width, model.views) == (config.height, config.width, tuple(config.trained_views))
-    with torch.device("meta"):
-        network = build(name)
-    assert sum(parameter.numel() for parameter in network.parameters()) / 1e6 == pytest.approx(
-        model.parameters, abs=0.05
-    )
+    assert millions(name) == pytest.approx(model.parameters, abs=0.05)
     assert model.gaussians == getattr(config, "gaussians", True)
+
+
+def millions(preset: str) -> float:
+    """The number of a network's parameters, in millions."""
+    with torch.device("meta"):
+        network = build(preset)
+    return sum(parameter.numel() for parameter in network.parameters()) / 1e6
+
+
+def test_the_size_of_the_bundled_model_is_its_presets():
+    assert millions(read_model(bundled_model()).metadata.preset) == pytest.approx(BUNDLED_MILLIONS, abs=0.05)
 
 
 @pytest.mark.parametrize("name", KNOWN_MODELS)
