@@ -25,7 +25,7 @@ def test_webgpu_gives_the_splats_of_webassembly(chromium, scene: Path, tmp_path:
     site = tmp_path / "site"
     assert run_command(web, site, "--size", SIZE) == 0
     browser = chromium(GPU_FLAGS)
-    page = browser.new_page()
+    page = browser.new_context(reduced_motion="reduce").new_page()
     with serving(site) as (address, _):
         opened(page, address)
         if not page.evaluate("async () => 'gpu' in navigator && (await navigator.gpu.requestAdapter()) !== null"):
