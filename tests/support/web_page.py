@@ -3,12 +3,14 @@
 import base64
 import threading
 from contextlib import contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
 from idesplat.runtime.splats.gaussians import Gaussians
 from idesplat.runtime.splats.io import read_splats
-from idesplat.runtime.web.serving import page_server
+from idesplat.runtime.web.serving import PageHandler
 
 TIMEOUT_MS = 240_000
 TOLERANCE = 1e-3  # of a standard deviation, in the median
@@ -23,10 +25,17 @@ DROP = """(files) => {
 }"""
 
 
+class StaticHost(PageHandler):
+    """A host that sends no header for cross-origin isolation, as most: the page's service worker adds it."""
+
+    def end_headers(self) -> None:
+        SimpleHTTPRequestHandler.end_headers(self)
+
+
 @contextmanager
 def serving(folder: Path):
-    """The address of a server of the folder, and the server."""
-    server = page_server(folder, "127.0.0.1", 0)
+    """The address of a static host of the folder, and its server."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(StaticHost, directory=str(folder)))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     try:
         yield f"http://127.0.0.1:{server.server_address[1]}/", server
@@ -36,7 +45,7 @@ def serving(folder: Path):
 
 
 def opened(page, address: str) -> None:
-    """Open the page, and wait until its service worker has isolated it, which takes a reload."""
+    """Open the page, and wait until its service worker has isolated it, for which it reloads once."""
     page.goto(address)
     page.wait_for_function("crossOriginIsolated && navigator.serviceWorker.controller !== null")
 

@@ -165,7 +165,7 @@ def test_webgpu_is_refused_for_a_graph_that_was_not_exported_for_it(browser, sit
     """There it would be wrong without an error."""
     page = browser.new_page()
     with serving(site) as (address, _):
-        page.goto(address)
+        opened(page, address)
         page.set_input_files("#files", files_of(captured))
         call = "cameras => import('./idesplat.js').then(({ reconstruct }) => reconstruct(files.files, cameras, "
         call += "{ provider: 'webgpu' })).catch((error) => error.message)"
@@ -189,7 +189,7 @@ def test_colmap_cameras_are_the_commands(browser, site, tmp_path):
     texts = [(tmp_path / name).read_text() for name in ("cameras.txt", "images.txt")]
     page = browser.new_page()
     with serving(site) as (address, _):
-        page.goto(address)
+        opened(page, address)
         found = on_page(page, "idesplat.parseColmap(...given)", texts)
         of_one_file = page.evaluate(
             "(names) => import('./modules/dropped_files.js').then(({ readCameraFiles }) => readCameraFiles("
