@@ -31,7 +31,7 @@ test: setup
 pytest: setup
 	$(PYTEST) -m "not webgpu"
 
-# A whole network on a WebGPU adapter in software: four minutes.
+# Whole networks on a WebGPU adapter in software: some ten minutes.
 webgpu: setup
 	$(PYTEST) -m webgpu
 
