@@ -1,10 +1,11 @@
 VENV ?= .venv
 PYTHON ?= python3
 BIN := $(VENV)/bin
-# Two processes of one thread each are faster than one of two threads: most tests are too small to share out.
+# Processes of one thread each are faster than one of two threads: most tests are too small to share out. With two for
+# each of two cores, a core has work while a test waits for a browser, for Ray or for a process that it started.
 # Kept by malloc, large buffers save some 6 % of the processor's time.
 KEEP := MALLOC_MMAP_THRESHOLD_=4294967296 MALLOC_TRIM_THRESHOLD_=4294967296
-PYTEST := OMP_NUM_THREADS=1 $(KEEP) $(BIN)/python -m pytest --quiet -n 2 --dist loadfile --no-loadscope-reorder
+PYTEST := OMP_NUM_THREADS=1 $(KEEP) $(BIN)/python -m pytest --quiet -n 4 --dist loadfile --no-loadscope-reorder
 
 .PHONY: setup test pytest webgpu quick check docs demo web weights clean
 

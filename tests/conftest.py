@@ -78,12 +78,12 @@ def run_command(main, *arguments) -> int:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Give each of several processes its own cores: the threads of ONNX Runtime wait actively for each other."""
+    """Give each of several processes its own cores, or one core: ONNX Runtime's threads wait actively for each other."""
     worker = getattr(config, "workerinput", None)
     if worker is not None and hasattr(os, "sched_setaffinity"):
         number, count = int(worker["workerid"].removeprefix("gw")), int(worker["workercount"])
         cores = sorted(os.sched_getaffinity(0))
-        os.sched_setaffinity(0, set(cores[number::count]) or cores)
+        os.sched_setaffinity(0, set(cores[number::count]) or {cores[number % len(cores)]})
 
 
 # Fixtures that export a network, train one, or make the weights of a released one.
