@@ -78,7 +78,7 @@ def run_command(main, *arguments) -> int:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Give each of several processes its own cores, or one core: ONNX Runtime's threads wait actively for each other."""
+    """Give each of several processes its own cores, or one: ONNX Runtime's threads wait actively for each other."""
     worker = getattr(config, "workerinput", None)
     if worker is not None and hasattr(os, "sched_setaffinity"):
         number, count = int(worker["workerid"].removeprefix("gw")), int(worker["workercount"])

@@ -29,7 +29,8 @@ def form(scene):
 
 @pytest.mark.posix
 def test_a_service_that_stops_finishes_what_runs_and_answers_what_waits(model, scene, tmp_path):
-    options = ("--model", model, "--max-memory", 1, "--max-size", "4096x4096")
+    # Compiling the refinement, where it was not compiled before, takes more than one gigabyte.
+    options = ("--model", model, "--max-memory", 2, "--max-size", "4096x4096")
     with running_service(tmp_path, *options) as service, service.client() as client:
         other = {"Origin": "http://example.org"}
         assert client.get("/metrics", headers=other).status_code == 403
@@ -51,7 +52,8 @@ def test_a_service_that_stops_finishes_what_runs_and_answers_what_waits(model, s
         assert client.post("/v1/scenes", files=form(scene), data=FAST).status_code == 503
         assert client.get("/ready").status_code == 503
         assert client.get("/health").status_code == 200
-        assert wait_for(client, running["id"])["state"] == "done"
+        found = wait_for(client, running["id"])
+        assert found["state"] == "done", found
         assert client.get(running["url"] + "/scene.ply").content.startswith(b"ply")
         assert service.process.wait(30) == 0
     assert list(tmp_path.iterdir()) == []

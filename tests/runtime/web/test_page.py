@@ -35,7 +35,7 @@ SIZE = "64x96"
 MAX_ROTATION_DEG, MAX_SHIFT = 0.5, 0.02
 FOCAL_MM = 29  # of these images, rounded
 # The viewer sorts the splats in the background.
-TRIES, BETWEEN_MS = 20, 500
+TRIES, BETWEEN_MS = 60, 500
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,10 @@ const STEP = 0.05; // radians, and share of the distance, of a key
 const SWING = 0.2; // radians to each side
 const SWING_S = 6;
 const MAX_PIXEL_RATIO = 2;
-const DRAWN_S = 1; // after a change, of which the end of a sort in the background is one
+// Drawn after a change, of which the end of a sort in the background is one: so long, and so many frames where each takes
+// longer.
+const DRAWN_S = 1;
+const DRAWN_FRAMES = 3;
 
 /** Shows one scene. `dispose` frees the graphics memory. */
 export class Viewer {
@@ -27,7 +30,7 @@ export class Viewer {
     this.scene.add(this.pivot);
     this.controls = new OrbitControls(this.camera, canvas);
     this.swinging = false;
-    this.changed = performance.now();
+    this.touch();
     this.controls.addEventListener("change", () => this.touch());
     this.onKey = (event) => this.key(event);
     canvas.addEventListener("keydown", this.onKey);
@@ -56,6 +59,7 @@ export class Viewer {
   /** Draw for a while: a scene that nobody turns costs no power. */
   touch() {
     this.changed = performance.now();
+    this.drawn = 0;
   }
 
   /** Back to the first view. */
@@ -77,8 +81,10 @@ export class Viewer {
       this.swung = angle;
     }
     this.controls.update();
-    if (!this.swinging && performance.now() - this.changed > 1000 * DRAWN_S) return;
+    const isDrawn = this.drawn >= DRAWN_FRAMES && performance.now() - this.changed > 1000 * DRAWN_S;
+    if (isDrawn && !this.swinging) return;
     this.renderer.render(this.scene, this.camera);
+    this.drawn += 1;
   }
 
   key(event) {
