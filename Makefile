@@ -7,6 +7,9 @@ BIN := $(VENV)/bin
 KEEP := MALLOC_MMAP_THRESHOLD_=4294967296 MALLOC_TRIM_THRESHOLD_=4294967296
 PYTEST := OMP_NUM_THREADS=1 $(KEEP) $(BIN)/python -m pytest --quiet -n 4 --dist loadfile --no-loadscope-reorder
 
+# With compiled modules kept, hundreds of processes of the tests don't compile them again.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: setup test pytest webgpu quick check docs demo web weights clean
 
 setup: $(VENV)/.ready

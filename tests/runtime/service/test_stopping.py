@@ -30,7 +30,7 @@ def form(scene):
 @pytest.mark.posix
 def test_a_service_that_stops_finishes_what_runs_and_answers_what_waits(model, scene, tmp_path):
     # Compiling the refinement, where it was not compiled before, takes more than one gigabyte.
-    options = ("--model", model, "--max-memory", 2, "--max-size", "4096x4096")
+    options = ("--model", model, "--max-memory", 2, "--max-size", "8192x8192")
     with running_service(tmp_path, *options) as service, service.client() as client:
         other = {"Origin": "http://example.org"}
         assert client.get("/metrics", headers=other).status_code == 403
@@ -38,7 +38,7 @@ def test_a_service_that_stops_finishes_what_runs_and_answers_what_waits(model, s
         assert client.get("/metrics", headers={"Host": "rebound.example.org"}).status_code == 403
 
         if sys.platform == "linux":
-            huge = client.post("/v1/scenes", files=form(scene), data=FAST | {"size": "4096x4096"}).json()
+            huge = client.post("/v1/scenes", files=form(scene), data=FAST | {"size": "8192x8192"}).json()
             found = wait_for(client, huge["id"])
             assert found["state"] == "failed"
             assert "memory" in found["error"] and "/" not in found["error"]
