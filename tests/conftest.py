@@ -39,10 +39,10 @@ SMALL = IDESplatConfig(
     dpt=DPTConfig(features=16, channels=(12, 24, 32, 48), disparity_channels=8),
     dpbus=(
         DPBUConfig(channels=64, candidates=33, scale=1, unet=UNetConfig(channels=32, levels=3)),
-        DPBUConfig(channels=16, candidates=17, scale=2, unet=UNetConfig(channels=16, levels=3, shuffle=2)),
-        DPBUConfig(channels=8, candidates=9, scale=4, unet=UNetConfig(channels=8, levels=3, shuffle=4)),
+        DPBUConfig(channels=16, candidates=17, scale=2, unet=UNetConfig(channels=16, levels=4)),
+        DPBUConfig(channels=8, candidates=9, scale=4, unet=UNetConfig(channels=8, levels=5)),
     ),
-    residual_unet=UNetConfig(channels=8, levels=3, shuffle=4),
+    residual_unet=UNetConfig(channels=8, levels=5),
     focus=FocusConfig(channels=32, heads=4, topk=(256, 128, 64)),
     height=64,
     width=96,
@@ -50,8 +50,8 @@ SMALL = IDESplatConfig(
 
 
 def small_network() -> IDESplat:
-    """The small network with weights that are always the same: of a seed with which few pixels hang on rounding."""
-    torch.manual_seed(3)
+    """The small network with weights that are always the same."""
+    torch.manual_seed(0)
     return IDESplat(SMALL).eval()
 
 
