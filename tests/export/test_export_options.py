@@ -93,12 +93,11 @@ def test_int8_qdq_is_symmetric_with_weights_by_channel(hub: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("opset", "ir_version"), ((17, 8), (21, 10)))
-def test_other_opsets_and_weights_in_a_file(
-    opset, ir_version, small_checkpoint, presets, kept_traces, exported, tmp_path, capsys
-) -> None:
+def test_other_opsets_and_weights_in_a_file(opset, ir_version, checkpoint, hub, kept_traces, tmp_path, capsys) -> None:
+    capsys.readouterr()
     path = tmp_path / "model.onnx"
     arguments = ("--opset", opset, "--no-verify", "--external-data")
-    assert run_command(cli.main, small_checkpoint, path, *arguments) == 0
+    assert run_command(cli.main, checkpoint, path, *arguments) == 0
     printed = capsys.readouterr()
     assert "not compared with PyTorch" in printed.err
     (weights,) = tmp_path.glob("*.data")
@@ -107,7 +106,7 @@ def test_other_opsets_and_weights_in_a_file(
     model = onnx.load(path)
     assert [(entry.domain, entry.version) for entry in model.opset_import] == [("", opset)]
     assert model.ir_version == ir_version
-    np.testing.assert_allclose(depth(path), depth(exported[0]), rtol=1e-3)
+    np.testing.assert_allclose(depth(path), depth(hub / "onnx" / "model.onnx"), rtol=1e-3)
 
 
 @pytest.mark.parametrize(

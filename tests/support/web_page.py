@@ -45,9 +45,13 @@ def serving(folder: Path):
 
 
 def opened(page, address: str) -> None:
-    """Open the page, and wait until its service worker has isolated it, for which it reloads once."""
+    """Open the page, and wait until its service worker has isolated it, for which it reloads once, and it takes files.
+
+    It says what it may run on after all its events have their handlers.
+    """
     page.goto(address)
     page.wait_for_function("crossOriginIsolated && navigator.serviceWorker.controller !== null")
+    page.wait_for_function("document.getElementById('environment').textContent !== ''")
 
 
 def drop(page, files: list[Path]) -> None:
