@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from ...model.common.backbone import Backbone
 from ...model.common.dinov2 import DinoV2
 from ...model.common.dpt import DPTHead
-from ...model.common.layers import ConcatConv1x1, ConvFFN, Upsample2x
+from ...model.common.layers import ConcatConv1x1, ConvFFN, DepthwiseConv, Upsample2x
 from ...model.common.mv_transformer import MultiViewTransformer
 from ...model.common.unet import CostRegulariser
 from ...model.idesplat.focused_attention import GaussianFocusedModule
@@ -27,11 +27,16 @@ BF16_MODULES = (
 )
 # Methods that `forward` does not call.
 BF16_METHODS = {DPTHead: ("features",)}
+# Modules inside those whose gradients take three to five times as long in bfloat16: depthwise convolutions of maps in
+# channels-last order.
+FLOAT32_MODULES = (DepthwiseConv,)
 
 
 def with_bfloat16(model: IDESplat) -> IDESplat:
-    """The same network, with the modules of BF16_MODULES under autocast; weights stay in float32."""
+    """The same network, with BF16_MODULES but for FLOAT32_MODULES under autocast; weights stay in float32."""
     for module in model.modules():
+        if isinstance(module, FLOAT32_MODULES):
+            _run_in_float32(module)
         if isinstance(module, BF16_MODULES):
             _run_in_bf16(module, "forward")
         for kind, names in BF16_METHODS.items():
@@ -51,6 +56,17 @@ def _run_in_bf16(module: nn.Module, name: str) -> None:
         return _to_float32(found)
 
     setattr(module, name, in_bf16)
+
+
+def _run_in_float32(module: nn.Module) -> None:
+    method = module.forward
+
+    @wraps(method)
+    def in_float32(tokens: Tensor, *arguments: Any) -> Tensor:
+        with torch.autocast("cpu", enabled=False):
+            return method(tokens.float(), *arguments)
+
+    module.forward = in_float32
 
 
 def _to_float32(value: Any) -> Any:
