@@ -70,6 +70,20 @@ def train(
         PerceptualKind,
         typer.Option(help="Perceptual distance of rendered views: LPIPS (if installed), EfficientNet-Lite0, or none."),
     ] = PerceptualKind.LPIPS,
+    pm_loss: Annotated[
+        float, typer.Option(help="Weight of PM-Loss against true points or --pointmaps; 0.005 in the paper.", min=0)
+    ] = 0.0,
+    pointmaps: Annotated[
+        Path | None,
+        typer.Option(help="Folder of the captures' pointmaps, FOLDER/IMAGE.npy with [height, width, 3] points."),
+    ] = None,
+    consistency: Annotated[
+        float, typer.Option(help="Weight of depth that agrees with points matched between views.", min=0)
+    ] = 0.0,
+    aperture: Annotated[
+        float,
+        typer.Option(help="Diameter of the lens of captures with shallow focus; nearest depth is 1.", min=0),
+    ] = 0.0,
     precision: Annotated[
         Precision,
         typer.Option(help="Arithmetic of convolutions and attention; bf16 is faster on CPUs that support it."),
@@ -108,6 +122,10 @@ def train(
         precision=precision.value,
         textures=str(textures.resolve()) if textures else "",
         perceptual=perceptual.value,
+        pm_loss=pm_loss,
+        pointmaps=str(pointmaps.resolve()) if pointmaps else "",
+        consistency=consistency,
+        aperture=aperture,
     )
     config = network_config(settings)
     _announce(out, init, data or [])

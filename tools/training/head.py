@@ -155,7 +155,7 @@ def _packed(sample: HeadSample) -> dict[str, Tensor]:
     views = {field.name: getattr(sample.views, field.name) for field in fields(TrainingViews)}
     for name in ("images", "target_images"):
         views[name] = (views[name] * 255).round().to(torch.uint8)
-    del views["inverse_depth"]  # the head's loss does not use it
+    del views["inverse_depth"], views["pointmap"]  # the head's loss does not use them
     inputs = sample.inputs._asdict()
     return {**views, **{name: value.half() if name.startswith(HALVED) else value for name, value in inputs.items()}}
 

@@ -1,5 +1,6 @@
 """Choices that a training run is given; importing them loads no PyTorch."""
 
+from dataclasses import dataclass
 from enum import StrEnum
 
 
@@ -31,3 +32,20 @@ class Precision(StrEnum):
 
     FLOAT32 = "float32"
     BF16 = "bf16"
+
+
+@dataclass(frozen=True)
+class OptionalTerms:
+    """Terms of the loss that are left out where their value is 0.
+
+    pm_loss: weight of PM-Loss beside the squared error of rendered views (`objectives.pointmap`). consistency: weight
+    of the multi-view consistency beside it (`objectives.consistency`). aperture: diameter of the lens with which the
+    target views of captures are rendered, in scene units, near being 1; 0 for a pinhole (`objectives.defocus`).
+    """
+
+    pm_loss: float = 0.0
+    consistency: float = 0.0
+    aperture: float = 0.0
+
+
+NO_TERMS = OptionalTerms()

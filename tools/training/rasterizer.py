@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ...model.common.quaternions import quaternions_to_matrices
 from ...model.common.sh import SH_0, sh_basis
-from ...runtime.geometry.projection import EPS2D, FOV_MARGIN
+from ...runtime.geometry.projection import DISC_STD, EPS2D, FOV_MARGIN
 from ...runtime.rendering.types import MAX_ALPHA, MIN_ALPHA
 from ...runtime.system.compilation import compiled
 
@@ -35,6 +35,8 @@ def rasterize(
     width: int,
     height: int,
     background: Tensor,
+    aperture: float = 0.0,
+    focus: float = 1.0,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Render Gaussians; returns rgb [height, width, 3], alpha and depth [height, width].
 
@@ -42,13 +44,18 @@ def rasterize(
     [gaussians, 3]. opacities: in [0, 1], [gaussians]. sh: degree 0 to 3, [gaussians, (degree + 1)^2, 3].
     viewmat: world-to-camera, OpenCV axes, [4, 4]. K: pixels, pixel centres at .5, [3, 3]. background: [3].
     depth: sum of z-depth with the weights of colour, not divided by alpha. All tensors have one float type, on the CPU.
+    aperture: diameter of a thin lens in world units, 0 for a pinhole. focus: z-depth of its plane in focus.
     """
     camera_means = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     seen = torch.nonzero(camera_means.detach()[:, 2] > NEAR)[:, 0]
     if len(seen) < len(means):
         camera_means, means, quats = camera_means[seen], means[seen], quats[seen]
         scales, opacities, sh = scales[seen], opacities[seen], sh[seen]
-    centres, conics = _project(camera_means, quats, scales, viewmat, K, width, height)
+    centres, covariances = _project(camera_means, quats, scales, viewmat, K, width, height)
+    if aperture:
+        covariances, dimming = _defocus(covariances, camera_means[:, 2], K, aperture, focus)
+        opacities = opacities * dimming
+    conics = _conics(covariances)
     colours = _colours(sh, means, -viewmat[:3, :3].T @ viewmat[:3, 3])
     values = torch.cat([colours, camera_means[:, 2:]], dim=-1)  # [gaussians, 4]
     image, transmittance = _Composite.apply(centres, conics, opacities, values, width, height)
@@ -64,7 +71,7 @@ def _project(
     width: int,
     height: int,
 ) -> tuple[Tensor, Tensor]:
-    """Means in pixels [gaussians, 2] and inverse 2D covariances (xx, xy, yy) [gaussians, 3]."""
+    """Means in pixels [gaussians, 2] and 2D covariances (xx, xy, yy) in pixels^2 [gaussians, 3]."""
     x, y, z = camera_means.unbind(-1)
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     centres = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
@@ -81,8 +88,26 @@ def _project(
     xx = (half_u * half_u).sum(dim=-1) + EPS2D
     xy = (half_u * half_v).sum(dim=-1)
     yy = (half_v * half_v).sum(dim=-1) + EPS2D
-    determinant = xx * yy - xy * xy
-    return centres, torch.stack([yy, -xy, xx], dim=-1) / determinant[:, None]
+    return centres, torch.stack([xx, xy, yy], dim=-1)
+
+
+def _conics(covariances: Tensor) -> Tensor:
+    """Inverses (xx, xy, yy) of 2D covariances, [gaussians, 3] each."""
+    xx, xy, yy = covariances.unbind(-1)
+    return torch.stack([yy, -xy, xx], dim=-1) / _determinants(covariances)[:, None]
+
+
+def _determinants(covariances: Tensor) -> Tensor:
+    xx, xy, yy = covariances.unbind(-1)
+    return xx * yy - xy * xy
+
+
+def _defocus(covariances: Tensor, z: Tensor, K: Tensor, aperture: float, focus: float) -> tuple[Tensor, Tensor]:
+    """2D covariances [gaussians, 3] with the lens's blur, and the factor by which opacities fall, [gaussians]."""
+    std = DISC_STD * aperture * (1 / focus - 1 / z)
+    added = torch.stack([(K[0, 0] * std) ** 2, torch.zeros_like(std), (K[1, 1] * std) ** 2], dim=-1)
+    blurred = covariances + added
+    return blurred, (_determinants(covariances) / _determinants(blurred)).clamp(max=1).sqrt()
 
 
 def _scaled_axes(quats: Tensor, scales: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from ...model.idesplat.config import IDESplatConfig
 from ...model.registry import PRESETS
 from ...runtime.errors import InputError
-from .options import Objective, Part
+from .options import Objective, OptionalTerms, Part
 from .schedule import Phase, training_phases
 
 # The ViT and the downsampling levels of its head need more than one patch of 14 pixels a side.
@@ -21,7 +21,8 @@ class TrainingSettings:
     batch: scenes of a step. size: side of the images in the last phase, in pixels. lr, vit_lr: highest learning rates.
     seed: of weights and scenes. init: a checkpoint to start from, or empty. data: folders of captures.
     scenes: number of different scenes if the head alone is trained, otherwise 0. real_ratio: share of the scenes that
-    are captures. textures: folder of images for the textures of synthetic scenes, or empty.
+    are captures. textures: folder of images for the textures of synthetic scenes, or empty. pm_loss, consistency,
+    aperture: as of `OptionalTerms`. pointmaps: folder of the captures' pointmaps, or empty.
     """
 
     preset: str
@@ -41,6 +42,15 @@ class TrainingSettings:
     precision: str = "float32"
     textures: str = ""
     perceptual: str = "lpips"
+    pm_loss: float = 0.0
+    pointmaps: str = ""
+    consistency: float = 0.0
+    aperture: float = 0.0
+
+    @property
+    def terms(self) -> OptionalTerms:
+        """The optional terms of the loss."""
+        return OptionalTerms(self.pm_loss, self.consistency, self.aperture)
 
     @property
     def phases(self) -> tuple[Phase, ...]:
@@ -67,9 +77,24 @@ def network_config(settings: TrainingSettings) -> IDESplatConfig:
         raise InputError(
             f"--objective {settings.objective}: captures have no true depth; use photometric, or --real-ratio"
         )
+    _check_terms(settings)
     config = presets[settings.preset]
     largest = max(phase.downsample for phase in settings.phases)
     multiple = largest * max(config.size_multiple, MIN_SIZE_MULTIPLE)
     if settings.size % multiple:
         raise InputError(f"--size {settings.size}: must be a multiple of {multiple} for this preset and these phases")
     return config
+
+
+def _check_terms(settings: TrainingSettings) -> None:
+    """Raise InputError if an optional term of the loss could have no effect."""
+    given = {"--pm-loss": settings.pm_loss, "--consistency": settings.consistency, "--aperture": settings.aperture}
+    used = [option for option, value in given.items() if value]
+    if used and settings.part == Part.HEAD:
+        raise InputError(f"{used[0]}: trains depth, which --train head leaves as it is; leave one of them out")
+    if used and not settings.renders:
+        raise InputError(f"{used[0]}: needs Gaussians, which --objective depth does not train; use another objective")
+    if settings.pointmaps and not (settings.pm_loss and settings.data):
+        raise InputError("--pointmaps: are those of captures for PM-Loss; add --data and --pm-loss, such as 0.005")
+    if settings.aperture and not settings.data:
+        raise InputError("--aperture: is the lens of captures; add --data")

@@ -27,6 +27,8 @@ VIT_PREFIX = "encoder.vit."
 FROZEN_PREFIX = "encoder.photo.network."
 # Settings that checkpoints of earlier versions have under another name.
 RENAMED_SETTINGS = {"gradual": "curriculum"}
+# Settings that checkpoints of earlier versions lack, with the value that they had.
+SETTINGS_OF_OLDER_RUNS = {"pm_loss": 0.0, "pointmaps": "", "consistency": 0.0, "aperture": 0.0}
 # A part that older checkpoints lack; newly initialised, it is an identity.
 OPTIONAL_PREFIX = "gaussians.cross_view."
 
@@ -114,7 +116,8 @@ class TrainingState:
         except Exception as error:  # torch.load raises errors of many types for other files
             reason = (str(error).splitlines() or [type(error).__name__])[0]
             raise InputError(f"{path}: not a checkpoint of a training run ({reason}); choose another --out") from None
-        before = {RENAMED_SETTINGS.get(name, name): value for name, value in training["settings"].items()}
+        stored = {RENAMED_SETTINGS.get(name, name): value for name, value in training["settings"].items()}
+        before = SETTINGS_OF_OLDER_RUNS | stored
         changed = [
             f"{name} was {before.get(name)}, not {settings[name]}"
             for name in settings

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
+from ...model.common.gaussian_adapter import WorldGaussians
 from ...model.common.geometry import denormalize_intrinsics, invert_rigid
 from ...model.common.layers import resize
 from ...model.idesplat.dpbu import Cameras, DPBUOutput
@@ -14,7 +15,10 @@ from ...model.idesplat.encoder import EncoderFeatures
 from ...model.idesplat.network import IDESplat
 from .data.samples import TrainingViews
 from .losses import candidate_spacing, dpbu_loss, inverse_depth_loss, monocular_loss, offset_prior, photometric_loss
-from .options import Objective
+from .objectives.consistency import consistency_loss
+from .objectives.defocus import defocus_loss
+from .objectives.pointmap import exact_pointmap, pointmap_loss
+from .options import NO_TERMS, Objective, OptionalTerms
 from .perceptual import Perceptual
 from .rasterizer import rasterize
 from .schedule import Phase
@@ -24,6 +28,8 @@ PHOTOMETRIC_WEIGHT = 10.0
 # Weight of both beside the depth losses, which are errors in candidate spacings. Without it the gradients that reach
 # the DPBUs from rendered views are a thousandth of those from depth; with it, some tenth.
 RENDERING_WEIGHT = 100.0
+# Weight of the defocus loss, an L1 error, beside the squared error.
+DEFOCUS_WEIGHT = 0.1
 # The metric `within` is the share of pixels whose depth has a smaller relative error.
 WITHIN = 0.05
 
@@ -32,14 +38,16 @@ WITHIN = 0.05
 class PhaseOutput:
     """The predictions of the parts that a phase runs.
 
-    inverse_depth: the finest one, [views, 1, h, w]; of the images' size if all three DPBUs ran. raw, rendered: where
-    the phase has Gaussians, their raw parameters [views, parameters, H, W], and target views [targets, 3, H, W].
+    inverse_depth: the finest one, [views, 1, h, w]; of the images' size if all three DPBUs ran. raw, gaussians,
+    rendered: where the phase has Gaussians, their raw parameters [views, parameters, H, W], the Gaussians in the order
+    of views and pixels, and target views [targets, 3, H, W].
     """
 
     encoded: EncoderFeatures
     dpbus: tuple[DPBUOutput, ...]
     inverse_depth: Tensor
     raw: Tensor | None = None
+    gaussians: WorldGaussians | None = None
     rendered: Tensor | None = None
 
 
@@ -59,7 +67,7 @@ def run_phase(model: IDESplat, views: TrainingViews, phase: Phase) -> PhaseOutpu
         return PhaseOutput(encoded, outputs, fused)
     predicted = model.gaussians(views.images, cameras, encoded, outputs)
     rendered = render_targets(predicted.gaussians, views)
-    return PhaseOutput(encoded, outputs, 1 / predicted.depth[:, None], predicted.raw, rendered)
+    return PhaseOutput(encoded, outputs, 1 / predicted.depth[:, None], predicted.raw, predicted.gaussians, rendered)
 
 
 def render_targets(gaussians: tuple[Tensor, ...], views: TrainingViews) -> Tensor:
@@ -109,6 +117,7 @@ def scene_loss(
     objective: Objective,
     perceptual: Perceptual | None,
     step: int = 0,
+    terms: OptionalTerms = NO_TERMS,
 ) -> tuple[Tensor, dict[str, float]]:
     """The loss of a scene, and what is logged.
 
@@ -130,9 +139,31 @@ def scene_loss(
         if phase.dpbus == 3:
             loss = loss + inverse_depth_loss(output.inverse_depth, views.inverse_depth[:, None], spacing)
     if output.raw is not None and output.rendered is not None:
-        photometric = photometric_loss(output.rendered, views.target_images, perceptual)
-        loss = loss + RENDERING_WEIGHT * (PHOTOMETRIC_WEIGHT * photometric + offset_prior(output.raw))
+        rendering = rendering_loss(output, views, perceptual, terms)
+        loss = loss + RENDERING_WEIGHT * (PHOTOMETRIC_WEIGHT * rendering + offset_prior(output.raw))
     return loss, {"loss": float(loss.detach()), **entry}
+
+
+def rendering_loss(
+    output: PhaseOutput, views: TrainingViews, perceptual: Perceptual | None, terms: OptionalTerms
+) -> Tensor:
+    """The photometric loss of the target views, and the terms that are asked for.
+
+    With a lens, the defocus loss takes the place of the photometric loss of captures. PM-Loss compares synthetic scenes
+    with their exact points, and captures with their pointmap, where they have one.
+    """
+    assert output.gaussians is not None and output.rendered is not None
+    if terms.aperture and views.inverse_depth is None:
+        loss = DEFOCUS_WEIGHT * defocus_loss(output.gaussians, views, terms.aperture)
+    else:
+        loss = photometric_loss(output.rendered, views.target_images, perceptual)
+    if terms.pm_loss:
+        pointmap = views.pointmap if views.inverse_depth is None else exact_pointmap(views)
+        if pointmap is not None:
+            loss = loss + terms.pm_loss * pointmap_loss(output.gaussians.means, pointmap)
+    if terms.consistency:
+        loss = loss + terms.consistency * consistency_loss(1 / output.inverse_depth[:, 0], views)
+    return loss
 
 
 @torch.no_grad()

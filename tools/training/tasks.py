@@ -19,7 +19,7 @@ from .head import (
     reset_opacity,
     scene_index,
 )
-from .options import Objective
+from .options import NO_TERMS, Objective, OptionalTerms
 from .perceptual import Perceptual
 from .schedule import Phase, training_phases
 from .step import scene_loss
@@ -64,9 +64,10 @@ class FullNetworkTask(TrainingTask[TrainingViews]):
         source: Source,
         real_ratio: float,
         perceptual: Perceptual | None,
+        terms: OptionalTerms = NO_TERMS,
     ) -> None:
         """size: side of the images in the last phase, in pixels. real_ratio: probability of a capture."""
-        self.phases, self.objective, self.perceptual = phases, objective, perceptual
+        self.phases, self.objective, self.perceptual, self.terms = phases, objective, perceptual, terms
         self.seed, self.size, self.source, self.real_ratio = seed, size, source, real_ratio
 
     def spec(self, step: int, slot: int, phase: Phase) -> SampleSpec:
@@ -81,7 +82,7 @@ class FullNetworkTask(TrainingTask[TrainingViews]):
 
     def loss(self, model: IDESplat, sample: TrainingViews, step: int, phase: Phase) -> Losses:
         """As `scene_loss`."""
-        return scene_loss(model, sample, phase, self.objective, self.perceptual, step)
+        return scene_loss(model, sample, phase, self.objective, self.perceptual, step, self.terms)
 
 
 class HeadTask(TrainingTask[HeadSample]):

@@ -196,7 +196,8 @@ def _sources(settings: TrainingSettings, config: IDESplatConfig) -> tuple[Source
     synthetic = partial(generate_views, photos=photos)
     if not settings.data:
         return synthetic, synthetic
-    captures = CaptureScenes([Path(folder) for folder in settings.data], config.near, config.far)
+    pointmaps = Path(settings.pointmaps) if settings.pointmaps else None
+    captures = CaptureScenes([Path(folder) for folder in settings.data], config.near, config.far, pointmaps)
     if settings.real_ratio == 1:
         return captures.load, captures.load_held_out
     return (
@@ -214,7 +215,9 @@ def _task(settings: TrainingSettings, model: IDESplat, source: Source, features:
         cache = FeatureCache(features, model, source, description)
         return HeadTask(cache, settings.seed, size, batch, settings.scenes, settings.real_ratio, perceptual)
     objective = Objective(settings.objective)
-    return FullNetworkTask(settings.phases, objective, settings.seed, size, source, settings.real_ratio, perceptual)
+    return FullNetworkTask(
+        settings.phases, objective, settings.seed, size, source, settings.real_ratio, perceptual, settings.terms
+    )
 
 
 def _perceptual(settings: TrainingSettings) -> Perceptual | None:

@@ -20,6 +20,7 @@ from ....runtime.views.batch import ViewBatch, build_view_batch
 from ....runtime.views.depth_range import estimate_depth_range
 from ....runtime.views.loader import load_view
 from ...synthetic.sampler import zoom_intrinsics
+from .pointmaps import check_pointmap, load_pointmap
 from .samples import SampleSpec, TrainingViews
 
 CAMERAS = "transforms.json"
@@ -41,11 +42,13 @@ class CaptureScenes:
     for_training, held_out: for each folder, its images with their cameras.
     """
 
-    def __init__(self, folders: Sequence[Path], near: float, far: float) -> None:
-        """Read the folders' cameras; raises InputError if cameras or images are missing, or too few.
+    def __init__(self, folders: Sequence[Path], near: float, far: float, pointmaps: Path | None = None) -> None:
+        """Read the folders' cameras; raises InputError if cameras, images or pointmaps are missing, or too few.
 
         near, far: the depth range that the network is trained for. As in inference, scenes are scaled to this near.
+        pointmaps: folder with a pointmap for each image, FOLDER/IMAGE.npy (`data.pointmaps`).
         """
+        self.pointmaps = pointmaps
         self.for_training: list[PosedPaths] = []
         self.held_out: list[PosedPaths] = []
         for folder in folders:
@@ -53,6 +56,9 @@ class CaptureScenes:
             self.held_out.append(posed[::HOLD_OUT_EVERY])
             self.for_training.append([pair for index, pair in enumerate(posed) if index % HOLD_OUT_EVERY])
             _check_enough(folder, len(self.for_training[-1]), len(self.held_out[-1]))
+            if pointmaps is not None:
+                for path, _ in self.for_training[-1]:
+                    check_pointmap(pointmaps, path)
         self.depth_range = near, far
 
     def load(self, spec: SampleSpec) -> TrainingViews:
@@ -82,7 +88,11 @@ class CaptureScenes:
     ) -> TrainingViews:
         batch = build_view_batch([*context, *targets], None, spec.height, spec.width)
         crops = [_load_crop(rng, pair, zoom, spec) for pair, zoom in zip(targets, spec.target_zooms, strict=True)]
-        return self._normalized(batch, len(context), crops)
+        views = self._normalized(batch, len(context), crops)
+        if self.pointmaps is None:
+            return views
+        points = [load_pointmap(self.pointmaps, *pair, spec.height, spec.width) for pair in context]
+        return replace(views, pointmap=torch.from_numpy(np.concatenate(points)))
 
     def _normalized(self, batch: ViewBatch, context: int, targets: Sequence[tuple[Tensor, Tensor]]) -> TrainingViews:
         """The sample in the network's units. targets: images [3, H, W] and intrinsics [3, 3]."""

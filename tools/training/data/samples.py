@@ -45,6 +45,9 @@ class TrainingViews:
     target_images: Tensor  # [targets, 3, H, W]
     target_extrinsics: Tensor  # [targets, 4, 4]
     target_intrinsics: Tensor  # [targets, 3, 3]
+    # Of captures, where given: a point for each pixel of the context views, in a frame and a scale of its own, NaN
+    # where unknown, [context * H * W, 3].
+    pointmap: Tensor | None = None
 
 
 def prefetch(specs: Iterator[SampleSpec], load: Callable[[SampleSpec], T]) -> Generator[T]:
