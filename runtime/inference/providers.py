@@ -173,18 +173,17 @@ def find_provider(text: str) -> Provider:
     Raises InputError that names what to install, or what is known.
     """
     wanted = _plain(text)
-    known = list(_known())
-    for provider in known:
+    for provider in _known():  # those of the table first: finding others reads the metadata of all packages
         if wanted in (_plain(provider.name), _plain(provider.ep_name)):
             if not is_installed(provider):
                 instead = " instead of onnxruntime" if _replaces_onnxruntime(provider) else ""
-                there = ", ".join(other.name for other in known if is_installed(other))
+                there = ", ".join(other.name for other in _known() if is_installed(other))
                 raise InputError(
                     f"execution provider {provider.name} is not installed; pip install {provider.package}{instead} "
                     f"(for {provider.hardware}; installed: {there})"
                 )
             return provider
-    names = ", ".join(provider.name for provider in known)
+    names = ", ".join(provider.name for provider in _known())
     raise InputError(f"execution provider {text}: unknown; choose {AUTO} or one of {names}")
 
 
