@@ -28,7 +28,7 @@ def continue_background(gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarr
     pose = surfaces.extrinsics[view]
     points = (surfaces.rays(view)[row, column] * continued[row, column, None]) @ pose[:3, :3].T + pose[:3, 3]
     hidden = np.zeros(len(points), bool)
-    _find_hidden(points, surfaces.neighbors[view], surfaces.depth, kept, surfaces.viewmats, surfaces.Ks, hidden)
+    find_hidden(points, surfaces.neighbors[view], surfaces.depth, kept, surfaces.viewmats, surfaces.Ks, hidden)
     row, column, points = row[hidden], column[hidden], points[hidden]
     copied = source[row, column]
     copies = gaussians.select(copied)
@@ -68,7 +68,7 @@ def _find_sources(
 
 
 @compiled()
-def _find_hidden(
+def find_hidden(
     points: np.ndarray,  # [points, 3]
     neighbors: np.ndarray,
     depth: np.ndarray,  # [views, height, width]

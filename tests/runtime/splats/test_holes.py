@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from idesplat.runtime.geometry.intrinsics import denormalize_intrinsics
 from idesplat.runtime.rendering.render import render_view
+from idesplat.runtime.splats.backdrop import BEHIND, CELL, MARGIN
 from idesplat.runtime.splats.gaussians import Gaussians
-from idesplat.runtime.splats.holes import close_holes
+from idesplat.runtime.splats.holes import close_holes, close_surfaces
 from idesplat.runtime.splats.surfaces import Surfaces
 
 SIZE = 48
@@ -49,9 +50,9 @@ def pixel_sized(depth: np.ndarray, extrinsics: np.ndarray) -> tuple[Gaussians, S
 
 
 def closed(depth: np.ndarray, extrinsics: np.ndarray) -> tuple[Gaussians, Gaussians]:
-    """Pixel-sized Gaussians before and after the closing of holes."""
+    """Pixel-sized Gaussians before and after the closing of surfaces."""
     gaussians, surfaces = pixel_sized(depth, extrinsics)
-    return gaussians, close_holes(gaussians, surfaces, np.ones(depth.shape, bool))
+    return gaussians, close_surfaces(gaussians, surfaces, np.ones(depth.shape, bool))
 
 
 def orbiting(degrees: float) -> np.ndarray:
@@ -128,7 +129,7 @@ def test_nothing_is_added_where_another_view_looks() -> None:
     """A second camera that sees the wall beside the patch has nothing put before it."""
     gaussians, surfaces = pixel_sized(np.concatenate([patch_before_a_wall()] * 2), shifted(0, 0))
     surfaces.depth[1] = 20 * DISTANCE
-    after = close_holes(gaussians, surfaces, np.ones(surfaces.depth.shape, bool))
+    after = close_surfaces(gaussians, surfaces, np.ones(surfaces.depth.shape, bool))
     assert len(after) == len(gaussians)
 
 
@@ -136,4 +137,54 @@ def test_removed_pixels_stay_removed() -> None:
     gaussians, surfaces = pixel_sized(slanted(20)[None], shifted(0))
     kept = np.ones((1, SIZE, SIZE), bool)
     kept[0, :10] = False
-    assert len(close_holes(gaussians, surfaces, kept)) == kept.sum()
+    assert len(close_surfaces(gaussians, surfaces, kept)) == kept.sum()
+
+
+def with_backdrop(
+    depth: np.ndarray, extrinsics: np.ndarray, kept: np.ndarray | None = None
+) -> tuple[Gaussians, Gaussians]:
+    """What closes the surfaces, and the backdrop that `close_holes` adds to it."""
+    gaussians, surfaces = pixel_sized(depth, extrinsics)
+    kept = np.ones(depth.shape, bool) if kept is None else kept
+    closed, whole = (close(gaussians, surfaces, kept) for close in (close_surfaces, close_holes))
+    return closed, whole.select(np.arange(len(closed), len(whole)))
+
+
+def test_a_backdrop_covers_what_no_view_sees() -> None:
+    """Beyond the frame, and behind a patch from far aside; the view itself does not see it."""
+    closed, backdrop = with_backdrop(patch_before_a_wall(), shifted(0))
+    whole = Gaussians.concatenate([closed, backdrop])
+    aside = shifted(0.8)[0]  # a tenth of the frame is beyond the wall's border
+    alphas = [render_view(each, aside, K, SIZE, SIZE).alpha for each in (closed, whole)]
+    assert alphas[0].min() < 0.01 and alphas[1].min() > 0.7
+    own = [render_view(each, np.eye(4), K, SIZE, SIZE).rgb[MIDDLE, MIDDLE] for each in (closed, whole)]
+    np.testing.assert_allclose(own[0], own[1], atol=0.01)
+
+
+def test_a_backdrop_lies_behind_the_farthest_surface_around() -> None:
+    _, backdrop = with_backdrop(patch_before_a_wall(), shifted(0))
+    np.testing.assert_allclose(backdrop.means[:, 2], 2 * DISTANCE * (1 + BEHIND), rtol=1e-5)
+    side = SIZE / CELL + 2 * np.ceil(MARGIN * SIZE / CELL)
+    assert len(backdrop) == side**2
+
+
+def test_a_backdrop_has_the_colour_of_the_background() -> None:
+    depth = patch_before_a_wall()
+    gaussians, surfaces = pixel_sized(depth, shifted(0))
+    gaussians.sh[depth.ravel() == DISTANCE] = -1.0
+    kept = np.ones(depth.shape, bool)
+    added = close_holes(gaussians, surfaces, kept).sh[len(close_surfaces(gaussians, surfaces, kept)) :]
+    np.testing.assert_allclose(added, 0.5, atol=1e-5)
+
+
+def test_no_backdrop_where_another_view_looks_or_all_is_removed() -> None:
+    depth = np.concatenate([patch_before_a_wall()] * 2)
+    depth[1] = 20 * DISTANCE
+    _, backdrop = with_backdrop(depth, shifted(0, 0))
+    assert (backdrop.means[:, 2] > 20 * DISTANCE).sum() > 0
+    inside = np.abs(backdrop.means[:, :2] / backdrop.means[:, 2:]).max(axis=1) < 0.5
+    assert (backdrop.means[inside, 2] > 20 * DISTANCE).all()
+    kept = np.ones(depth.shape, bool)
+    kept[0] = False
+    _, backdrop = with_backdrop(depth, shifted(0, 0), kept)
+    assert (backdrop.means[:, 2] > 20 * DISTANCE).all()
