@@ -47,7 +47,7 @@ def make_backdrop(gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarray, vi
     scales = np.repeat((STD * CELL * z[hidden] / K[0, 0])[:, None], 3, axis=1)
     sh = np.zeros((count, gaussians.sh.shape[1], 3), np.float32)
     sh[:, 0] = (colour[row, column][hidden] - 0.5) / SH_0
-    quats = np.tile(np.float32([1, 0, 0, 0]), (count, 1))
+    quats = np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1))
     opacities = np.full(count, OPACITY, np.float32)
     return Gaussians(points[hidden].astype(np.float32), scales.astype(np.float32), quats, opacities, sh)
 
