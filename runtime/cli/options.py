@@ -213,8 +213,8 @@ CloseHoles = Annotated[
     bool,
     typer.Option(
         "--close-holes",
-        help="Fit the Gaussians' shapes to the surface, and let the background go on behind edges (--quality "
-        "standard and high do).",
+        help="Fit the Gaussians' shapes to the surface, and add background behind edges and beyond the frames "
+        "(--quality standard and high do).",
         rich_help_panel=FILTERS,
     ),
 ]
