@@ -82,7 +82,9 @@ def train(
     ] = 0.0,
     aperture: Annotated[
         float,
-        typer.Option(help="Diameter of the lens of captures with shallow focus; nearest depth is 1.", min=0),
+        typer.Option(
+            "--lens-diameter", help="Diameter of the lens of captures with shallow focus; nearest depth is 1.", min=0
+        ),
     ] = 0.0,
     precision: Annotated[
         Precision,

@@ -88,7 +88,7 @@ def network_config(settings: TrainingSettings) -> IDESplatConfig:
 
 def _check_terms(settings: TrainingSettings) -> None:
     """Raise InputError if an optional term of the loss could have no effect."""
-    given = {"--pm-loss": settings.pm_loss, "--consistency": settings.consistency, "--aperture": settings.aperture}
+    given = {"--pm-loss": settings.pm_loss, "--consistency": settings.consistency, "--lens-diameter": settings.aperture}
     used = [option for option, value in given.items() if value]
     if used and settings.part == Part.HEAD:
         raise InputError(f"{used[0]}: trains depth, which --train head leaves as it is; leave one of them out")
@@ -97,4 +97,4 @@ def _check_terms(settings: TrainingSettings) -> None:
     if settings.pointmaps and not (settings.pm_loss and settings.data):
         raise InputError("--pointmaps: are those of captures for PM-Loss; add --data and --pm-loss, such as 0.005")
     if settings.aperture and not settings.data:
-        raise InputError("--aperture: is the lens of captures; add --data")
+        raise InputError("--lens-diameter: is that of captures; add --data")

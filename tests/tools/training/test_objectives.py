@@ -212,7 +212,7 @@ def test_a_bad_pointmap_is_named(content: object, expected: str, tmp_path: Path)
         ({"pm_loss": 0.005, "part": "head", "init": "x.ckpt"}, "--pm-loss: trains depth"),
         ({"consistency": 1.0, "objective": "depth"}, "--consistency: needs Gaussians"),
         ({"pointmaps": "maps", "pm_loss": 0.005}, "--pointmaps: are those of captures"),
-        ({"aperture": 0.1}, "--aperture: is the lens of captures"),
+        ({"aperture": 0.1}, "--lens-diameter: is that of captures"),
     ),
 )
 def test_terms_without_effect_are_refused(changes: dict[str, object], expected: str) -> None:
