@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..config import EncoderConfig
-from .geometry import Cameras, invert_intrinsics, pixel_grid
+from .geometry import Cameras, unproject
 from .quaternions import matrices_to_quaternions, quaternion_product
 from .sh import SH_0, sh_rotation
 
@@ -59,7 +59,7 @@ class GaussianAdapter(nn.Module):
         """raw [views, parameters, H, W], depth [views, H, W], images [views, 3, H, W] in [0, 1] -> Gaussians."""
         base, sh = raw.flatten(2).split((BASE_PARAMETERS, 3 * self.coefficients), dim=1)
         logits, offsets, scales, rotations = base.transpose(1, 2).split(BASE_SIZES, dim=-1)
-        means = self._means(offsets.sigmoid(), depth, cameras)
+        means = unproject(depth, offsets.sigmoid(), cameras)
         scales = F.softplus(scales - SCALE_SHIFT).clamp(self.scale_min, self.scale_max)
         if self.in_pixels:
             scales = scales * self._pixel_sizes(depth, cameras)
@@ -68,16 +68,6 @@ class GaussianAdapter(nn.Module):
         sh = self._world_sh(sh.unflatten(1, (3, self.coefficients)), (images.flatten(2) - 0.5) / SH_0, camera)
         gaussians = WorldGaussians(means, scales, quats, logits.sigmoid()[..., 0], sh)
         return WorldGaussians(*(x.flatten(0, 1) for x in gaussians))
-
-    def _means(self, offsets: Tensor, depth: Tensor, cameras: Cameras) -> Tensor:
-        """Unprojected pixels, each shifted within itself by its offset in [0, 1]: [views, H * W, 3] in the world."""
-        _, height, width = depth.shape
-        x, y = pixel_grid(height, width, depth)
-        x = (x + offsets[..., 0]) / width  # [views, H * W]
-        y = (y + offsets[..., 1]) / height
-        rays = torch.stack([x, y, torch.ones_like(x)], dim=-1) @ invert_intrinsics(cameras.intrinsics).transpose(1, 2)
-        rotation, centre = cameras.extrinsics[:, :3, :3], cameras.extrinsics[:, None, :3, 3]
-        return centre + rays @ rotation.transpose(1, 2) * depth.flatten(1)[..., None]
 
     def _pixel_sizes(self, depth: Tensor, cameras: Cameras) -> Tensor:
         """The width of a pixel at its depth, depth / fx: [views, H * W, 1] in scene units."""

@@ -57,6 +57,21 @@ def pixel_grid(height: int, width: int, like: Tensor) -> tuple[Tensor, Tensor]:
     return x.repeat(height), y[:, None].expand(-1, width).flatten()
 
 
+def unproject(depth: Tensor, offsets: Tensor, cameras: Cameras) -> Tensor:
+    """The points in the world that lie in the pixels of depth maps, [views, H * W, 3].
+
+    depth: z-depth, [views, H, W]. offsets: of each point from its pixel's upper left corner, (x, y) in [0, 1],
+    [views, H * W, 2].
+    """
+    _, height, width = depth.shape
+    x, y = pixel_grid(height, width, depth)
+    x = (x + offsets[..., 0]) / width  # [views, H * W]
+    y = (y + offsets[..., 1]) / height
+    rays = torch.stack([x, y, torch.ones_like(x)], dim=-1) @ invert_intrinsics(cameras.intrinsics).transpose(1, 2)
+    rotation, centre = cameras.extrinsics[:, :3, :3], cameras.extrinsics[:, None, :3, 3]
+    return centre + rays @ rotation.transpose(1, 2) * depth.flatten(1)[..., None]
+
+
 def nearest_views(extrinsics: Tensor, count: int) -> Tensor:
     """The views that each view is matched with: the `count` others with the nearest camera centres.
 

@@ -34,7 +34,7 @@ def make_backdrop(gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarray, vi
     colours = np.stack([_cells(np.pad(channel, around, mode="edge")) for channel in image], axis=-1)
     farthest, colour = _farthest(cells, colours)
 
-    K, pose = surfaces.Ks[view], np.asarray(surfaces.extrinsics[view])
+    K, pose = surfaces.Ks[view], surfaces.extrinsics[view]
     row, column = np.nonzero(farthest > 0)
     z = farthest[row, column] * (1 + BEHIND)
     x = ((column + 0.5) * CELL - left - K[0, 2]) / K[0, 0]

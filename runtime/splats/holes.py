@@ -13,30 +13,26 @@ from .surfaces import Surfaces
 
 
 def close_holes(gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarray) -> Gaussians:
-    """The Gaussians of `close_surfaces`, then each view's `backdrop.make_backdrop`; arguments as there."""
-    views, pixels = len(kept), kept[0].size
-    backdrops = [make_backdrop(gaussians.select(_of_view(view, pixels)), surfaces, kept, view) for view in range(views)]
-    return Gaussians.concatenate([close_surfaces(gaussians, surfaces, kept), *backdrops])
-
-
-def close_surfaces(gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarray) -> Gaussians:
-    """The kept Gaussians in the shapes of `surface_shape.fit_to_surface`, then `background.continue_background`'s.
+    """The kept Gaussians, ordered by view, then what `close_view` adds.
 
     gaussians: one for each pixel, ordered by view, row, column. kept: those that filters kept, bool [views, height,
     width].
     """
-    views, pixels = len(kept), kept[0].size
-    spacings = surfaces.spacings  # computed once, and not by each thread
-
-    def close(view: int) -> tuple[Gaussians, Gaussians]:
-        own = gaussians.select(_of_view(view, pixels))
-        fitted = fit_to_surface(own, surfaces, spacings, kept, view)
-        return fitted.select(kept[view].ravel()), continue_background(fitted, surfaces, kept, view)
-
-    with ThreadPoolExecutor(min(views, thread_count())) as pool:
-        fitted, continued = zip(*pool.map(close, range(views)), strict=True)
-    return Gaussians.concatenate([*fitted, *continued])
+    _ = surfaces.spacings  # computed once, and not by each thread
+    with ThreadPoolExecutor(min(len(kept), thread_count())) as pool:
+        parts = list(pool.map(lambda view: close_view(gaussians, surfaces, kept, view), range(len(kept))))
+    return Gaussians.concatenate([part for each in zip(*parts, strict=True) for part in each])
 
 
-def _of_view(view: int, pixels: int) -> np.ndarray:
-    return np.arange(pixels * view, pixels * (view + 1))
+def close_view(
+    gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarray, view: int
+) -> tuple[Gaussians, Gaussians, Gaussians]:
+    """Of one view, the kept Gaussians in the shapes of `fit_to_surface`, the continued background and the backdrop."""
+    pixels = kept[view].size
+    own = gaussians.select(np.arange(pixels * view, pixels * (view + 1)))
+    fitted = fit_to_surface(own, surfaces, kept, view)
+    return (
+        fitted.select(kept[view].ravel()),
+        continue_background(fitted, surfaces, kept, view),
+        make_backdrop(own, surfaces, kept, view),
+    )

@@ -27,16 +27,14 @@ from .surfaces import Surfaces, project_to_pixel
 GROWTHS = np.array([1.3, 1.1, 1.0])
 
 
-def fit_to_surface(
-    gaussians: Gaussians, surfaces: Surfaces, spacings: np.ndarray, kept: np.ndarray, view: int
-) -> Gaussians:
+def fit_to_surface(gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarray, view: int) -> Gaussians:
     """The Gaussians of a view, one for each pixel, in shapes that close the surface.
 
     Those of surfaces that no more neighbours contradict than confirm are sheared along their rays, except where a
-    neighbour has denser samples of the surface. All of them are larger where few views see the surface. spacings:
-    the surfaces' own. kept: the pixels whose Gaussians are kept, bool [views, height, width].
+    neighbour has denser samples of the surface. All of them are larger where few views see the surface. kept: the
+    pixels whose Gaussians are kept, bool [views, height, width].
     """
-    shape = surfaces.depth.shape[1:]
+    shape, spacings = surfaces.depth.shape[1:], surfaces.spacings
     stretched, seen = np.zeros(shape, bool), np.zeros(shape, np.int64)
     _compare(
         surfaces.points[view], spacings[view], surfaces.neighbors[view], surfaces.depth, spacings,

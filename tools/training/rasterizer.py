@@ -6,6 +6,7 @@ its bounding box. The backward pass visits them back to front. Nothing is stored
 behind a splat, that before it is T / (1 - alpha).
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -60,6 +61,22 @@ def rasterize(
     values = torch.cat([colours, camera_means[:, 2:]], dim=-1)  # [gaussians, 4]
     image, transmittance = _Composite.apply(centres, conics, opacities, values, width, height)
     return image[..., :3] + transmittance[..., None] * background, 1 - transmittance, image[..., 3]
+
+
+def render_on_black(
+    gaussians: Sequence[Tensor],
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    aperture: float = 0.0,
+    focus: float = 1.0,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """As `rasterize`, of Gaussians (means, scales, quats, opacities, sh) as the network orders them."""
+    means, scales, quats, opacities, sh = gaussians
+    return rasterize(
+        means, quats, scales, opacities, sh, viewmat, K, width, height, torch.zeros(3), aperture=aperture, focus=focus
+    )
 
 
 def _project(

@@ -1,6 +1,7 @@
 """The state of a training run: weights, their exponential moving average (EMA), optimiser and step."""
 
 import math
+from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from ...runtime.errors import InputError
 from ...runtime.system.files import atomic_write, check_regular
 from .gather_attention import use_compiled_gather_attention
 from .initialization import new_model
+from .settings import TrainingSettings
 
 # EMA of the weights w at step n: ema <- d ema + (1 - d) w with d = min(EMA_DECAY, n / (n + EMA_START)).
 EMA_DECAY = 0.99
@@ -27,8 +29,8 @@ VIT_PREFIX = "encoder.vit."
 FROZEN_PREFIX = "encoder.photo.network."
 # Settings that checkpoints of earlier versions have under another name.
 RENAMED_SETTINGS = {"gradual": "curriculum"}
-# Settings that checkpoints of earlier versions lack, with the value that they had.
-SETTINGS_OF_OLDER_RUNS = {"pm_loss": 0.0, "pointmaps": "", "consistency": 0.0, "aperture": 0.0}
+# Settings that checkpoints of earlier versions may lack, with what those versions did.
+DEFAULT_SETTINGS = {field.name: field.default for field in fields(TrainingSettings) if field.default is not MISSING}
 # A part that older checkpoints lack; newly initialised, it is an identity.
 OPTIONAL_PREFIX = "gaussians.cross_view."
 
@@ -117,7 +119,7 @@ class TrainingState:
             reason = (str(error).splitlines() or [type(error).__name__])[0]
             raise InputError(f"{path}: not a checkpoint of a training run ({reason}); choose another --out") from None
         stored = {RENAMED_SETTINGS.get(name, name): value for name, value in training["settings"].items()}
-        before = SETTINGS_OF_OLDER_RUNS | stored
+        before = DEFAULT_SETTINGS | stored
         changed = [
             f"{name} was {before.get(name)}, not {settings[name]}"
             for name in settings

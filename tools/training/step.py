@@ -20,7 +20,7 @@ from .objectives.defocus import defocus_loss
 from .objectives.pointmap import exact_pointmap, pointmap_loss
 from .options import NO_TERMS, Objective, OptionalTerms
 from .perceptual import Perceptual
-from .rasterizer import rasterize
+from .rasterizer import render_on_black
 from .schedule import Phase
 
 # Weight of the photometric loss beside the offset prior.
@@ -72,14 +72,10 @@ def run_phase(model: IDESplat, views: TrainingViews, phase: Phase) -> PhaseOutpu
 
 def render_targets(gaussians: tuple[Tensor, ...], views: TrainingViews) -> Tensor:
     """Gaussians (means, scales, quats, opacities, sh) seen by the target cameras, on black, [targets, 3, H, W]."""
-    means, scales, quats, opacities, sh = gaussians
     height, width = views.target_images.shape[2:]
     Ks = denormalize_intrinsics(views.target_intrinsics, width, height)
-    background = torch.zeros(3)
-    images = [
-        rasterize(means, quats, scales, opacities, sh, viewmat, K, width, height, background)[0]
-        for viewmat, K in zip(invert_rigid(views.target_extrinsics), Ks, strict=True)
-    ]
+    viewmats = invert_rigid(views.target_extrinsics)
+    images = [render_on_black(gaussians, viewmat, K, width, height)[0] for viewmat, K in zip(viewmats, Ks, strict=True)]
     return torch.stack(images).permute(0, 3, 1, 2)
 
 

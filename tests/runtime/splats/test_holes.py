@@ -6,7 +6,7 @@ from idesplat.runtime.geometry.intrinsics import denormalize_intrinsics
 from idesplat.runtime.rendering.render import render_view
 from idesplat.runtime.splats.backdrop import BEHIND, CELL, MARGIN
 from idesplat.runtime.splats.gaussians import Gaussians
-from idesplat.runtime.splats.holes import close_holes, close_surfaces
+from idesplat.runtime.splats.holes import close_holes, close_view
 from idesplat.runtime.splats.surfaces import Surfaces
 
 SIZE = 48
@@ -47,6 +47,12 @@ def pixel_sized(depth: np.ndarray, extrinsics: np.ndarray) -> tuple[Gaussians, S
         np.full((count, 1, 3), 0.5, np.float32),
     )
     return gaussians, Surfaces(points, depth, extrinsics, np.tile(INTRINSICS, (len(depth), 1, 1)))
+
+
+def close_surfaces(gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarray) -> Gaussians:
+    """What `close_holes` gives but for the backdrop."""
+    parts = [close_view(gaussians, surfaces, kept, view)[:2] for view in range(len(kept))]
+    return Gaussians.concatenate([part for each in zip(*parts, strict=True) for part in each])
 
 
 def closed(depth: np.ndarray, extrinsics: np.ndarray) -> tuple[Gaussians, Gaussians]:

@@ -15,7 +15,7 @@ from torch import Tensor
 from ....model.common.gaussian_adapter import WorldGaussians
 from ....model.common.geometry import denormalize_intrinsics, invert_rigid
 from ..data.samples import TrainingViews
-from ..rasterizer import rasterize
+from ..rasterizer import render_on_black
 
 SSIM_WEIGHT = 0.2
 OUT_OF_FOCUS_WEIGHT = 0.5
@@ -36,7 +36,7 @@ def defocus_loss(gaussians: WorldGaussians, views: TrainingViews, aperture: floa
         with torch.no_grad():
             depth = _depth(gaussians, viewmat, K, width, height)
             focus = focused_depth(image, depth)
-        rendered = _render(gaussians, viewmat, K, width, height, aperture, focus)[0].permute(2, 0, 1)
+        rendered = render_on_black(gaussians, viewmat, K, width, height, aperture, focus)[0].permute(2, 0, 1)
         confusion = aperture * K[0, 0] * (1 / focus - 1 / depth).abs()
         losses.append(compare_defocused(rendered, image, confusion))
     return torch.stack(losses).mean()
@@ -84,19 +84,10 @@ def ssim_map(first: Tensor, second: Tensor) -> Tensor:
 
 def _depth(gaussians: WorldGaussians, viewmat: Tensor, K: Tensor, width: int, height: int) -> Tensor:
     """Rendered z-depth [H, W]; where nothing is rendered, the median."""
-    _, alpha, depth = _render(gaussians, viewmat, K, width, height, 0.0, 1.0)
+    _, alpha, depth = render_on_black(gaussians, viewmat, K, width, height)
     covered = alpha > MIN_ALPHA
     depth = depth / alpha.clamp(min=MIN_ALPHA)
     return torch.where(covered, depth, depth[covered].median() if covered.any() else 1.0)
-
-
-def _render(
-    gaussians: WorldGaussians, viewmat: Tensor, K: Tensor, width: int, height: int, aperture: float, focus: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    means, scales, quats, opacities, sh = gaussians
-    return rasterize(
-        means, quats, scales, opacities, sh, viewmat, K, width, height, torch.zeros(3), aperture=aperture, focus=focus
-    )
 
 
 def _mean(values: Tensor, weights: Tensor) -> Tensor:

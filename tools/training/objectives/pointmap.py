@@ -5,7 +5,7 @@ a scale of its own. A similarity aligns it with the means (Umeyama 1991), pixel 
 
     L_PM = mean over means mu of min_p' |mu - p'|^2,    p' the aligned points,
 
-so a mean between two surfaces is drawn to the nearer one instead of to the point of its own pixel.
+so a mean between two surfaces is pulled to the nearer one instead of to the point of its own pixel.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from ....model.common.geometry import denormalize_intrinsics, invert_intrinsics, pixel_grid
+from ....model.common.geometry import Cameras, unproject
 from ..data.samples import TrainingViews
 
 # Points that a similarity is determined by.
@@ -54,10 +54,6 @@ def umeyama(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray, 
 def exact_pointmap(views: TrainingViews) -> Tensor:
     """The points that the pixels of the context views show, from the true depth: [context * H * W, 3] in the world."""
     assert views.inverse_depth is not None
-    _, height, width = views.inverse_depth.shape
-    x, y = pixel_grid(height, width, views.inverse_depth)
-    pixels = torch.stack([x + 0.5, y + 0.5, torch.ones_like(x)], dim=-1)  # [H * W, 3]
-    inverse = invert_intrinsics(denormalize_intrinsics(views.intrinsics, width, height))
-    rays = pixels @ inverse.transpose(1, 2) / views.inverse_depth.flatten(1)[..., None]
-    rotation, centre = views.extrinsics[:, :3, :3], views.extrinsics[:, None, :3, 3]
-    return (centre + rays @ rotation.transpose(1, 2)).flatten(0, 1)
+    cameras = Cameras(views.extrinsics, views.intrinsics, views.near, views.far)
+    middle = torch.full((1, 1, 2), 0.5)
+    return unproject(1 / views.inverse_depth, middle, cameras).flatten(0, 1)
