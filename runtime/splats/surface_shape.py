@@ -22,30 +22,23 @@ from .gaussians import Gaussians
 from .merging import covariances, ellipsoids
 from .surfaces import Surfaces, project_to_pixel
 
-# Factors on the scales of what one view, two views, and more see: each view fills the gaps of the others. The bundled
-# model predicts a standard deviation of 0.45 pixels: from near, alpha between four opaque splats is 0.75; of 0.58, 0.9.
-GROWTHS = np.array([1.3, 1.1, 1.0])
-
 
 def fit_to_surface(gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarray, view: int) -> Gaussians:
     """The Gaussians of a view, one for each pixel, in shapes that close the surface.
 
     Those of surfaces that no more neighbours contradict than confirm are sheared along their rays, except where a
-    neighbour has denser samples of the surface. All of them are larger where few views see the surface. kept: the
-    pixels whose Gaussians are kept, bool [views, height, width].
+    neighbour has denser samples of the surface. kept: the pixels whose Gaussians are kept, bool [views, height, width].
     """
-    shape, spacings = surfaces.depth.shape[1:], surfaces.spacings
-    stretched, seen = np.zeros(shape, bool), np.zeros(shape, np.int64)
-    _compare(
+    spacings, stretched = surfaces.spacings, np.zeros(kept[view].shape, bool)
+    _find_stretched(
         surfaces.points[view], spacings[view], surfaces.neighbors[view], surfaces.depth, spacings,
-        kept, surfaces.viewmats, surfaces.Ks, stretched, seen,
+        kept, surfaces.viewmats, surfaces.Ks, stretched,
     )  # fmt: skip
     members = np.flatnonzero(stretched & kept[view])
     shear = _shears(surfaces, view, members)
     scales, quats = gaussians.scales.copy(), gaussians.quats.copy()
     scales[members], quats[members] = ellipsoids(shear @ covariances(gaussians, members) @ shear.swapaxes(1, 2))
-    growth = GROWTHS[np.minimum(seen, len(GROWTHS) - 1)].reshape(-1, 1)
-    return replace(gaussians, scales=(scales * growth).astype(np.float32), quats=quats)
+    return replace(gaussians, scales=scales, quats=quats)
 
 
 def _shears(surfaces: Surfaces, view: int, members: np.ndarray) -> np.ndarray:
@@ -57,7 +50,7 @@ def _shears(surfaces: Surfaces, view: int, members: np.ndarray) -> np.ndarray:
 
 
 @compiled()
-def _compare(
+def _find_stretched(
     points: np.ndarray,  # [height, width, 3]
     spacing: np.ndarray,  # [height, width]
     neighbors: np.ndarray,
@@ -67,13 +60,12 @@ def _compare(
     viewmats: np.ndarray,
     Ks: np.ndarray,
     stretched: np.ndarray,  # [height, width]
-    seen: np.ndarray,  # [height, width]
 ) -> None:
-    """Count the neighbours that see each point, and find those to stretch: see `fit_to_surface`."""
-    height, width = seen.shape
+    """Find the pixels whose Gaussians are sheared: see `fit_to_surface`."""
+    height, width = stretched.shape
     for row in range(height):
         for column in range(width):
-            against, denser = 0, False
+            confirmed, against, denser = 0, 0, False
             for view in neighbors:
                 z, y, x = project_to_pixel(points[row, column], viewmats[view], Ks[view], height, width)
                 if y < 0 or not kept[view, y, x]:
@@ -82,6 +74,6 @@ def _compare(
                 if z < surface * (1 - DEPTH_TOLERANCE):
                     against += 1
                 elif z <= surface * (1 + DEPTH_TOLERANCE):
-                    seen[row, column] += 1
+                    confirmed += 1
                     denser = denser or spacings[view, y, x] < spacing[row, column]
-            stretched[row, column] = seen[row, column] >= against and not denser
+            stretched[row, column] = confirmed >= against and not denser
