@@ -40,7 +40,7 @@ class SceneReconstructor:
         cache_gb: float = DEFAULT_GB,
         overwrite: bool = False,
     ) -> None:
-        check_settings(options, provider, splat_format)
+        check_settings(options, provider, splat_format, cache_gb)
         self._threads = session.threads or usable_cores()
         self._settings = make_settings(
             find_model(model),

@@ -117,8 +117,8 @@ def batch(
     if engine == Engine.RAY:  # its actors need not have this process's current folder
         source, target = (place.absolute() if isinstance(place, Path) else place for place in (source, target))
     chosen = read_scenes(source).of_shard(shard)
-    _check(engine, address, workers, cache_gb, [chosen.source, target])
-    check_settings(options, provider, splat_format)
+    _check(engine, address, workers, [chosen.source, target])
+    check_settings(options, provider, splat_format, cache_gb)
     if isinstance(target, Path):
         _check_local(chosen, target, None if overwrite else splats_name(splat_format))
     threads = session.threads or (1 if address else max(1, usable_cores() // workers))
@@ -174,7 +174,7 @@ def _run(
     return run_in_pool(scenes, workers, threads, settings)
 
 
-def _check(engine: str, address: str | None, workers: int, cache_gb: float, places: list[Place]) -> None:
+def _check(engine: str, address: str | None, workers: int, places: list[Place]) -> None:
     """Raise InputError for invalid arguments."""
     if engine not in tuple(Engine):
         raise InputError(f"--engine {engine}: expected {' or '.join(Engine)}")
@@ -182,8 +182,6 @@ def _check(engine: str, address: str | None, workers: int, cache_gb: float, plac
         raise InputError(f"--address {address}: is of a Ray cluster; add --engine ray")
     if workers < 1:
         raise InputError(f"--workers {workers}: expected 1 or more")
-    if not 0 <= cache_gb < float("inf"):
-        raise InputError(f"--cache-size {cache_gb}: expected a number of gigabytes")
     for place in places:
         if isinstance(place, str) and place.startswith("memory:"):
             raise InputError(f"{place}: lives in one process, and a batch has several; use SceneReconstructor")

@@ -69,11 +69,13 @@ class Settings:
     cache_bytes: int = int(DEFAULT_GB * GB)
 
 
-def check_settings(options: Mapping[str, Any] | None, provider: str, splat_format: str) -> None:
+def check_settings(options: Mapping[str, Any] | None, provider: str, splat_format: str, cache_gb: float) -> None:
     """Raise InputError for arguments of `make_settings` that are invalid, before a model is looked for."""
     check_options(options or {})
     candidates(provider)
     splats_name(splat_format)
+    if not 0 <= cache_gb < float("inf"):
+        raise InputError(f"--cache-size {cache_gb}: expected a number of gigabytes")
 
 
 def make_settings(

@@ -156,6 +156,14 @@ def test_nothing_of_others_is_replaced_in_a_store(scene, model):
     assert [name for name in memory.find("/owned")] == ["/owned/a/scene.ply"]
 
 
+@pytest.mark.parametrize("size", (float("nan"), float("inf"), -1.0))
+def test_a_cache_size_that_is_none_is_refused(size, scene, model, tmp_path):
+    with pytest.raises(InputError, match="expected a number of gigabytes"):
+        idesplat.SceneReconstructor(tmp_path, model=model, cache_gb=size)
+    with pytest.raises(InputError, match="expected a number of gigabytes"):
+        idesplat.batch(scene.parent, tmp_path, model=model, cache_gb=size)
+
+
 def test_places(tmp_path):
     assert parse_place("file:///data/a%20b") == Path("/data/a b")
     assert parse_place("s3://bucket/a/") == "s3://bucket/a"
