@@ -127,6 +127,7 @@ export function undistort(image, camera) {
   const [fx, fy] = camera.K;
   const [cx, cy] = [camera.K[2] - 0.5, camera.K[3] - 0.5]; // OpenCV's pixel centres are at whole numbers
   const bend = camera.fisheye ? fisheyeLens(camera.distortion) : perspectiveLens(camera.distortion);
+  /** @type {(x: number, y: number) => [number, number]} */
   const source = (x, y) => {
     const [u, v] = bend((x - cx) / fx, (y - cy) / fy);
     return [u * fx + cx, v * fy + cy];
@@ -134,6 +135,7 @@ export function undistort(image, camera) {
   return { image: remap(image, source), camera: { ...camera, distortion: null, fisheye: false } };
 }
 
+/** @param {number[]} distortion */
 function perspectiveLens([k1, k2, p1, p2, k3 = 0]) {
   return (x, y) => {
     const r2 = x * x + y * y;
@@ -142,6 +144,7 @@ function perspectiveLens([k1, k2, p1, p2, k3 = 0]) {
   };
 }
 
+/** @param {number[]} distortion */
 function fisheyeLens([k1, k2, k3, k4]) {
   return (x, y) => {
     const r = Math.hypot(x, y);

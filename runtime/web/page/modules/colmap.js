@@ -67,6 +67,7 @@ function parseImage(line, lenses) {
   return { name, ...lenses.get(camera), pose: invertRigid(rigid(toCamera, `images.txt: ${name}`)) };
 }
 
+/** @param {number[]} quat */
 function rotationMatrix([w, x, y, z]) {
   return [
     ...[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
