@@ -200,14 +200,20 @@ def _composite_band(
     transmittance = np.ones((band_rows, width))
     still_open = band_rows * width
     for splat in range(len(x)):
-        scale = np.float32(opacity_scale[splat])
-        for row in range(max(first_row[splat], top), min(first_row[splat] + rows[splat], top + band_rows)):
-            dy = row + 0.5 - y[splat]
-            reach_here = max(reach[splat] - dy * dy / (2 * y_variance[splat]), 0.0)
-            centre = x[splat] + shear[splat] * dy
-            first, length = _span(centre, np.sqrt(2 * reach_here * row_variance[splat]), width)
+        first_inside, end = max(first_row[splat], top), min(first_row[splat] + rows[splat], top + band_rows)
+        if first_inside >= end:
+            continue
+        # Read once: for the compiler, what is written below could change the arrays.
+        centre_x, centre_y, slant = x[splat], y[splat], shear[splat]
+        variance, variance_y, reach_peak = row_variance[splat], y_variance[splat], reach[splat]
+        scale, sharpness = np.float32(opacity_scale[splat]), np.float32(np.sqrt(0.5 / variance))
+        red, green, blue, depth = features[splat, 0], features[splat, 1], features[splat, 2], features[splat, 3]
+        for row in range(first_inside, end):
+            dy = row + 0.5 - centre_y
+            reach_here = max(reach_peak - dy * dy / (2 * variance_y), 0.0)
+            centre = centre_x + slant * dy
+            first, length = _span(centre, np.sqrt(2 * reach_here * variance), width)
             distance = np.float32(first + 0.5 - centre)
-            sharpness = np.float32(np.sqrt(0.5 / row_variance[splat]))
             log_peak = np.float32(reach_here + LOG_MIN_ALPHA)
             for step in range(length):
                 before = transmittance[row - top, first + step]
@@ -223,8 +229,10 @@ def _composite_band(
                 transmittance[row - top, first + step] = after
                 weight = alpha * np.float32(before)
                 pixel = sums[row - top, first + step]
-                for channel in range(4):
-                    pixel[channel] += weight * features[splat, channel]
+                pixel[0] += weight * red
+                pixel[1] += weight * green
+                pixel[2] += weight * blue
+                pixel[3] += weight * depth
                 pixel[4] += weight
         if still_open == 0:
             break
