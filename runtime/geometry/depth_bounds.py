@@ -4,10 +4,9 @@ import numpy as np
 
 MIN_POINTS = 20
 NEAR_PERCENTILE, FAR_PERCENTILE = 2, 98  # against outliers
-# Surfaces without points may lie outside the range of the points. On a hundred synthetic scenes with exact depth, these
-# factors leave 4 % of the pixels outside the bounds (0.7 and 1.5: 7 %), and the range of inverse depth is 1.8 times the
-# exact one.
-NEAR_FACTOR, FAR_FACTOR = 0.5, 2.0
+# Surfaces without points may lie outside the range of the points. A wider range leaves fewer of them out, and has fewer
+# depth candidates where the surfaces are: with 2 instead of 1.5, two views of the validation captures lose 0.25 dB.
+NEAR_FACTOR, FAR_FACTOR = 0.5, 1.5
 
 
 def depth_bounds(depths: np.ndarray) -> tuple[float, float] | None:

@@ -5,7 +5,7 @@ import { triangulatedDepths } from "./matching.js";
 
 export const MIN_POINTS = 20;
 const [NEAR_PERCENTILE, FAR_PERCENTILE] = [2, 98]; // against outliers
-const [NEAR_FACTOR, FAR_FACTOR] = [0.5, 2]; // surfaces without points may lie outside the range of the points
+const [NEAR_FACTOR, FAR_FACTOR] = [0.5, 1.5]; // surfaces without points may lie outside the range of the points
 
 /**
  * @param {number[][][]} matches that fit the cameras @param {number[]} pose of the first camera in the second's frame
