@@ -65,10 +65,7 @@ def rasterize(
     threads = min(MAX_THREADS, thread_count())
     kernels = _kernels()
     with ThreadPoolExecutor(threads) as pool:
-        starts = range(0, max(len(gaussians.means), 1), BLOCK_SIZE)
-        blocks = pool.map(lambda start: kernels.project(gaussians, start, view), starts)
-        splats = Splats(*map(np.concatenate, zip(*blocks, strict=True)))
-        splats = splats.select(_argsort_depth(splats.features[:, 3]))
+        splats = _project(gaussians, view, pool)
 
         def render_band(top: int) -> None:
             sums[top : top + band_rows] = kernels.composite_band(splats, top, min(band_rows, height - top), width)
@@ -86,6 +83,15 @@ def _kernels() -> ModuleType:
 
     rasterizer_numba.compile_all()
     return rasterizer_numba
+
+
+def _project(gaussians: GaussianArrays, view: View, pool: ThreadPoolExecutor) -> Splats:
+    """The splats that touch the image, nearest first."""
+    count = len(gaussians.means)
+    splats = Splats.allocate(count)
+    list(pool.map(lambda start: _kernels().project(gaussians, start, view, splats), range(0, count, BLOCK_SIZE)))
+    touching = np.flatnonzero(splats.rows)
+    return splats.select(touching[_argsort_depth(splats.features[touching, 3])])
 
 
 def _argsort_depth(depth: np.ndarray) -> np.ndarray:

@@ -4,7 +4,8 @@ They repeat the arithmetic of `rasterizer_numpy`, `geometry.projection` and `geo
 operations, and take the constants from there.
 """
 
-from math import exp, log
+from math import ceil, exp, log
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +17,10 @@ from .types import BLOCK_SIZE, MAX_ALPHA, MIN_ALPHA, MIN_LOG_TRANSMITTANCE, Gaus
 # Alpha is float32, as in NumPy's version: at a limit both must decide alike.
 MIN_ALPHA_32, MAX_ALPHA_32 = np.float32(MIN_ALPHA), np.float32(MAX_ALPHA)
 LOG_MIN_ALPHA = log(MIN_ALPHA)
+LOG_MIN_ALPHA_32 = np.float32(LOG_MIN_ALPHA)
+# exp at multiples of -1 / EXP_STEPS, down to MIN_ALPHA: what `_exp_of_falloff` starts from.
+EXP_STEPS = 16
+EXP_TABLE = np.exp(-np.arange(ceil(-LOG_MIN_ALPHA * EXP_STEPS) + 1) / EXP_STEPS).astype(np.float32)
 MIN_TRANSMITTANCE = exp(MIN_LOG_TRANSMITTANCE)
 ENDED = 0.0  # stands for the transmittance of a pixel that takes no further fragments
 
@@ -27,19 +32,16 @@ def compile_all() -> None:
     arrays = (np.array([[0, 0, 1]]), np.ones((1, 4)), np.ones((1, 3)), np.ones(1), np.zeros((1, 1, 3)))
     gaussian = GaussianArrays(*(array.astype(np.float32) for array in arrays))
     with compiling(fill_rotation, "the rasteriser"):
-        composite_band(project(gaussian, 0, View(np.eye(4), np.eye(3), 1, 1, 0.01, 0.0, 1.0)), 0, 1, 1)
+        splats = Splats.allocate(1)
+        project(gaussian, 0, View(np.eye(4), np.eye(3), 1, 1, 0.01, 0.0, 1.0), splats)
+        composite_band(splats, 0, 1, 1)
 
 
-def project(gaussians: GaussianArrays, start: int, view: View) -> Splats:
-    """Project the block of Gaussians from `start` on; those that touch the image, in the order given."""
-    block = GaussianArrays(*(field[start : start + BLOCK_SIZE] for field in gaussians))
-    count = len(block.means)
-    ellipses, spans = np.empty((7, count)), np.empty((3, count), np.int64)
-    features = np.empty((count, 4), np.float32)
-    _project(*(*block, *view), ellipses, spans, features)  # unpacked as one: mypy confuses two of different lengths
-    splats = Splats._make([*ellipses, *spans, features])
-    touching = (splats.rows > 0) & (splats.columns > 0)
-    return splats if touching.all() else splats.select(np.flatnonzero(touching))
+def project(gaussians: GaussianArrays, start: int, view: View, splats: Splats) -> None:
+    """Fill the splats of the block of Gaussians from `start` on."""
+    block = slice(start, start + BLOCK_SIZE)
+    given: list[Any] = [*(field[block] for field in gaussians), *view, *(field[block] for field in splats)]
+    _project(*given)
 
 
 def composite_band(splats: Splats, top: int, rows: int, width: int) -> np.ndarray:
@@ -63,11 +65,19 @@ def _project(
     near: float,
     aperture: float,
     focus: float,
-    ellipses: np.ndarray,  # [7, gaussians]
-    spans: np.ndarray,  # [3, gaussians]
-    features: np.ndarray,  # [gaussians, 4]
+    splat_x: np.ndarray,
+    splat_y: np.ndarray,
+    splat_shear: np.ndarray,
+    splat_row_variance: np.ndarray,
+    splat_y_variance: np.ndarray,
+    splat_reach: np.ndarray,
+    opacity_scale: np.ndarray,
+    first_row: np.ndarray,
+    rows: np.ndarray,
+    columns: np.ndarray,
+    features: np.ndarray,
 ) -> None:
-    """Fill the fields of `Splats`; a Gaussian that is not visible gets no rows."""
+    """Fill the fields of `Splats`; a Gaussian that does not touch the image gets no rows."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     margin_x, margin_y = FOV_MARGIN * 0.5 * width / fx, FOV_MARGIN * 0.5 * height / fy
     position = np.empty(3)
@@ -82,7 +92,7 @@ def _project(
                 point[axis] += viewmat[axis, other] * means[index, other]
         z = point[2]
         if not (z > near and opacities[index] >= MIN_ALPHA_32):
-            spans[1, index] = 0
+            rows[index] = 0
             continue
         slope_x, slope_y = point[0] / z, point[1] / z
         x, y = fx * slope_x + cx, fy * slope_y + cy
@@ -105,11 +115,15 @@ def _project(
         _, focused_row_variance = _shear_rows(xx, xy, yy)
         shear, row_variance = _shear_rows(x_variance, xy, y_variance)
         reach = np.log(np.float64(opacities[index] / MIN_ALPHA_32))
-        ellipses[0, index], ellipses[1, index], ellipses[2, index] = x, y, shear
-        ellipses[3, index], ellipses[4, index], ellipses[5, index] = row_variance, y_variance, reach
-        ellipses[6, index] = np.sqrt(min(focused_row_variance / row_variance * (yy / y_variance), 1.0))
-        spans[0, index], spans[1, index] = _span(y, np.sqrt(2 * reach * y_variance), height)
-        _, spans[2, index] = _span(x, np.sqrt(2 * reach * x_variance), width)
+        splat_x[index], splat_y[index], splat_shear[index] = x, y, shear
+        splat_row_variance[index], splat_y_variance[index], splat_reach[index] = row_variance, y_variance, reach
+        opacity_scale[index] = np.sqrt(min(focused_row_variance / row_variance * (yy / y_variance), 1.0))
+        first_row[index], rows[index] = _span(y, np.sqrt(2 * reach * y_variance), height)
+        _, columns[index] = _span(x, np.sqrt(2 * reach * x_variance), width)
+        if columns[index] == 0:
+            rows[index] = 0
+        if rows[index] == 0:
+            continue
         _fill_basis(means[index], position, basis)
         for channel in range(3):
             colour = np.float32(0.5)
@@ -180,6 +194,18 @@ def fill_sh_basis(x: float, y: float, z: float, basis: np.ndarray) -> None:
 
 
 @_compiled
+def _exp_of_falloff(x: np.float32) -> np.float32:
+    """exp(x) for x from LOG_MIN_ALPHA to 0, to 1e-7 of it: a third faster than the library's function.
+
+    From the nearest entry of EXP_TABLE by the Taylor series, whose next term is below 4e-8.
+    """
+    entry = np.uint64(np.float32(0.5) - np.float32(EXP_STEPS) * x)
+    rest = x + np.float32(entry) * np.float32(1 / EXP_STEPS)
+    series = np.float32(0.5) + rest * np.float32(1 / 6)
+    return EXP_TABLE[entry] * (np.float32(1) + rest * (np.float32(1) + rest * series))
+
+
+@_compiled
 def _composite_band(
     x: np.ndarray,
     y: np.ndarray,
@@ -207,10 +233,11 @@ def _composite_band(
         centre_x, centre_y, slant = x[splat], y[splat], shear[splat]
         variance, variance_y, reach_peak = row_variance[splat], y_variance[splat], reach[splat]
         scale, sharpness = np.float32(opacity_scale[splat]), np.float32(np.sqrt(0.5 / variance))
+        per_row = 0.5 / variance_y
         red, green, blue, depth = features[splat, 0], features[splat, 1], features[splat, 2], features[splat, 3]
         for row in range(first_inside, end):
             dy = row + 0.5 - centre_y
-            reach_here = max(reach_peak - dy * dy / (2 * variance_y), 0.0)
+            reach_here = max(reach_peak - dy * dy * per_row, 0.0)
             centre = centre_x + slant * dy
             first, length = _span(centre, np.sqrt(2 * reach_here * variance), width)
             distance = np.float32(first + 0.5 - centre)
@@ -220,7 +247,8 @@ def _composite_band(
                 if before == ENDED:
                     continue
                 falloff = (distance + np.float32(step)) * sharpness
-                alpha = min(max(np.exp(log_peak - falloff * falloff), MIN_ALPHA_32), MAX_ALPHA_32) * scale
+                exponent = min(max(log_peak - falloff * falloff, LOG_MIN_ALPHA_32), np.float32(0))
+                alpha = min(_exp_of_falloff(exponent), MAX_ALPHA_32) * scale
                 after = before * (np.float32(1) - alpha)
                 if after <= MIN_TRANSMITTANCE:  # this fragment is skipped, too
                     transmittance[row - top, first + step] = ENDED
@@ -228,11 +256,10 @@ def _composite_band(
                     continue
                 transmittance[row - top, first + step] = after
                 weight = alpha * np.float32(before)
-                pixel = sums[row - top, first + step]
-                pixel[0] += weight * red
-                pixel[1] += weight * green
-                pixel[2] += weight * blue
-                pixel[3] += weight * depth
-                pixel[4] += weight
+                sums[row - top, first + step, 0] += weight * red
+                sums[row - top, first + step, 1] += weight * green
+                sums[row - top, first + step, 2] += weight * blue
+                sums[row - top, first + step, 3] += weight * depth
+                sums[row - top, first + step, 4] += weight
         if still_open == 0:
             break

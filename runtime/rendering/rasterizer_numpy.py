@@ -13,24 +13,18 @@ from .types import BLOCK_SIZE, MAX_ALPHA, MIN_ALPHA, MIN_LOG_TRANSMITTANCE, Gaus
 CHUNK_FRAGMENTS = 1 << 18  # composited at once: the temporaries of a chunk fit the cache
 
 
-def project(gaussians: GaussianArrays, start: int, view: View) -> Splats:
-    """Project the block of Gaussians from `start` on; those that touch the image, in the order given."""
+def project(gaussians: GaussianArrays, start: int, view: View, splats: Splats) -> None:
+    """Fill the splats of the block of Gaussians from `start` on."""
     block = GaussianArrays(*(field[start : start + BLOCK_SIZE] for field in gaussians))
     camera_means = block.means @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]  # [block, 3]
-    visible = _indices((camera_means[:, 2] > view.near) & (block.opacities >= MIN_ALPHA))
+    visible = np.flatnonzero((camera_means[:, 2] > view.near) & (block.opacities >= MIN_ALPHA))
     camera_means, block = camera_means[visible], GaussianArrays(*(field[visible] for field in block))
 
-    splats = _ellipses(camera_means, block, view)
-    touching = _indices((splats.rows > 0) & (splats.columns > 0))
-    splats = splats.select(touching)
-    splats.features[:, :3] = _colours(block.means[touching], block.sh[touching], view.viewmat)
-    splats.features[:, 3] = camera_means[touching, 2]
-    return splats
-
-
-def _indices(mask: np.ndarray) -> np.ndarray | slice:
-    """The indices at which a mask is true; where it is true everywhere, a slice, which copies nothing."""
-    return slice(None) if mask.all() else np.flatnonzero(mask)
+    seen = _ellipses(camera_means, block, view)
+    seen.features[:, :3] = _colours(block.means, block.sh, view.viewmat)
+    seen.features[:, 3] = camera_means[:, 2]
+    for field, values in zip(splats, seen, strict=True):
+        field[start + visible] = values
 
 
 def _ellipses(camera_means: np.ndarray, gaussians: GaussianArrays, view: View) -> Splats:
@@ -52,6 +46,7 @@ def _ellipses(camera_means: np.ndarray, gaussians: GaussianArrays, view: View) -
     reach = np.log(gaussians.opacities / MIN_ALPHA, dtype=np.float64)
     first_row, rows = _span(y, np.sqrt(2 * reach * y_variance), view.height)
     _, columns = _span(x, np.sqrt(2 * reach * x_variance), view.width)
+    rows[columns == 0] = 0
     features = np.empty((len(camera_means), 4), np.float32)
     return Splats(x, y, shear, row_variance, y_variance, reach, opacity_scale, first_row, rows, columns, features)
 
@@ -123,7 +118,7 @@ def _fragments(splats: Splats, width: int, is_open: np.ndarray) -> _Fragments:
     owner, row = _expand(splats.rows)  # [rows]
     row += splats.first_row[owner]
     dy = row + 0.5 - splats.y[owner]
-    reach = np.maximum(splats.reach[owner] - dy * dy / (2 * splats.y_variance[owner]), 0)
+    reach = np.maximum(splats.reach[owner] - dy * dy * (0.5 / splats.y_variance)[owner], 0)
     row_variance = splats.row_variance[owner]
     centre = splats.x[owner] + splats.shear[owner] * dy
     first, length = _span(centre, np.sqrt(2 * reach * row_variance), width)

@@ -62,7 +62,7 @@ class View(NamedTuple):
 
 
 class Splats(NamedTuple):
-    """Projected Gaussians that touch the image, in pixels. All [splats], float64 unless said otherwise.
+    """Projected Gaussians, in pixels. All [splats], float64 unless said otherwise. One that is not seen has no rows.
 
     An ellipse is evaluated row by row. On the row at distance dy from the centre, the 2D Gaussian with covariance
     (xx, xy, yy) is a 1D Gaussian centred at x + shear * dy, shear = xy / yy, with the variance xx - xy^2 / yy
@@ -77,9 +77,15 @@ class Splats(NamedTuple):
     reach: np.ndarray  # log(opacity / MIN_ALPHA): how far the exponent may fall before alpha is below MIN_ALPHA
     opacity_scale: np.ndarray  # area of the ellipse in focus / area of this one, at most 1
     first_row: np.ndarray  # int64
-    rows: np.ndarray  # int64
+    rows: np.ndarray  # int64; 0 where the splat does not touch the image
     columns: np.ndarray  # int64, width of the bounding box of the ellipse
     features: np.ndarray  # [splats, 4] float32: red, green, blue, depth
+
+    @staticmethod
+    def allocate(count: int) -> "Splats":
+        """Room for so many; none touches the image before it is filled."""
+        ellipses, spans = np.empty((7, count)), np.zeros((3, count), np.int64)
+        return Splats._make([*ellipses, *spans, np.empty((count, 4), np.float32)])
 
     def select(self, index: np.ndarray | slice) -> "Splats":
         """The splats at these indices, in this order."""
