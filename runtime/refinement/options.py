@@ -7,7 +7,7 @@ from typing import Any
 # (docs/reconstruction.md). The network's are small and opaque, so that a layer that is nearer by a hair hides the
 # others; larger ones that let light through have gradients and average.
 FEW_VIEWS = 2
-FEW_VIEWS_OPACITY, FEW_VIEWS_SCALE = 0.9, 2.0
+FEW_VIEWS_OPACITY, FEW_VIEWS_SCALE = 0.5, 2.0
 MANY_VIEWS_OPACITY, MANY_VIEWS_SCALE = 0.35, 1.8
 
 # Learning rate of poses where they are refined.

@@ -10,6 +10,9 @@ across the ray at that depth. A Gaussian is sheared along its ray,
 
 which moves nothing across the rays: its image in its own view stays, and a ball becomes an ellipsoid in the surface.
 What other views see through keeps its shape, as wrong surfaces should not hide right ones.
+
+Where two views show one surface, their nearly opaque Gaussians compete: the layer that is nearer by a hair hides the
+other. With less opacity their colours mix.
 """
 
 from dataclasses import replace
@@ -22,23 +25,27 @@ from .gaussians import Gaussians
 from .merging import covariances, ellipsoids
 from .surfaces import Surfaces, project_to_pixel
 
+SHARED_OPACITY = 0.65  # of its own, for a Gaussian of a surface that another view shows, too
+
 
 def fit_to_surface(gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarray, view: int) -> Gaussians:
     """The Gaussians of a view, one for each pixel, in shapes that close the surface.
 
     Those of surfaces that no more neighbours contradict than confirm are sheared along their rays, except where a
-    neighbour has denser samples of the surface. kept: the pixels whose Gaussians are kept, bool [views, height, width].
+    neighbour has denser samples of the surface. Those that a neighbour confirms are less opaque. kept: the pixels whose
+    Gaussians are kept, bool [views, height, width].
     """
-    spacings, stretched = surfaces.spacings, np.zeros(kept[view].shape, bool)
-    _find_stretched(
+    spacings, (stretched, shared) = surfaces.spacings, np.zeros((2, *kept[view].shape), bool)
+    _ask_neighbors(
         surfaces.points[view], spacings[view], surfaces.neighbors[view], surfaces.depth, spacings,
-        kept, surfaces.viewmats, surfaces.Ks, stretched,
+        kept, surfaces.viewmats, surfaces.Ks, stretched, shared,
     )  # fmt: skip
     members = np.flatnonzero(stretched & kept[view])
     shear = _shears(surfaces, view, members)
     scales, quats = gaussians.scales.copy(), gaussians.quats.copy()
     scales[members], quats[members] = ellipsoids(shear @ covariances(gaussians, members) @ shear.swapaxes(1, 2))
-    return replace(gaussians, scales=scales, quats=quats)
+    opacities = gaussians.opacities * np.where(shared.ravel(), np.float32(SHARED_OPACITY), np.float32(1))
+    return replace(gaussians, scales=scales, quats=quats, opacities=opacities)
 
 
 def _shears(surfaces: Surfaces, view: int, members: np.ndarray) -> np.ndarray:
@@ -50,7 +57,7 @@ def _shears(surfaces: Surfaces, view: int, members: np.ndarray) -> np.ndarray:
 
 
 @compiled()
-def _find_stretched(
+def _ask_neighbors(
     points: np.ndarray,  # [height, width, 3]
     spacing: np.ndarray,  # [height, width]
     neighbors: np.ndarray,
@@ -60,8 +67,9 @@ def _find_stretched(
     viewmats: np.ndarray,
     Ks: np.ndarray,
     stretched: np.ndarray,  # [height, width]
+    shared: np.ndarray,  # [height, width]
 ) -> None:
-    """Find the pixels whose Gaussians are sheared: see `fit_to_surface`."""
+    """Find the pixels whose Gaussians are sheared, and those that a neighbour confirms: see `fit_to_surface`."""
     height, width = stretched.shape
     for row in range(height):
         for column in range(width):
@@ -77,3 +85,4 @@ def _find_stretched(
                     confirmed += 1
                     denser = denser or spacings[view, y, x] < spacing[row, column]
             stretched[row, column] = confirmed >= against and not denser
+            shared[row, column] = confirmed > 0

@@ -192,3 +192,23 @@ def test_no_backdrop_where_another_view_looks_or_all_is_removed() -> None:
     kept[0] = False
     _, backdrop = with_backdrop(depth, shifted(0, 0), kept)
     assert (backdrop.means[:, 2] > 20 * DISTANCE).all()
+
+
+def test_views_of_one_surface_mix() -> None:
+    """Of a plane that two views show in two greys, a camera between them sees a grey nearer to the middle of both."""
+    before, surfaces = pixel_sized(np.concatenate([slanted(0)[None]] * 2), shifted(-0.1, 0.1))
+    before.sh[: SIZE * SIZE] += 0.5
+    after = close_surfaces(before, surfaces, np.ones((2, SIZE, SIZE), bool))
+    middle = before.colours.mean()
+    shown = [render_view(each, np.eye(4), K, SIZE, SIZE).rgb[MIDDLE, MIDDLE].mean() for each in (before, after)]
+    assert abs(shown[1] - middle) < 0.85 * abs(shown[0] - middle)
+
+
+@pytest.mark.parametrize("second", [None, 20 * DISTANCE], ids=["one view", "another view sees through it"])
+def test_a_surface_of_one_view_stays_opaque(second: float | None) -> None:
+    views = 1 if second is None else 2
+    before, surfaces = pixel_sized(np.concatenate([slanted(0)[None]] * views), shifted(*[0] * views))
+    if second is not None:
+        surfaces.depth[1] = second
+    after, _, _ = close_view(before, surfaces, np.ones((views, SIZE, SIZE), bool), 0)
+    np.testing.assert_array_equal(after.opacities, before.opacities[: SIZE * SIZE])
