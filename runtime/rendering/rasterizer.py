@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, DTypeLike
 
 from ..errors import InputError
 from ..system.threads import thread_count
-from .types import BLOCK_SIZE, GaussianArrays, Rendering, Splats, View
+from .types import BLOCK_SIZE, SPLAT, GaussianArrays, Rendering, View
 
 # NumPy sorts 16-bit integers by radix, several times faster than wider ones, so a band has no more pixels than this.
 MAX_BAND_PIXELS = 1 << 16
@@ -85,13 +85,13 @@ def _kernels() -> ModuleType:
     return rasterizer_numba
 
 
-def _project(gaussians: GaussianArrays, view: View, pool: ThreadPoolExecutor) -> Splats:
-    """The splats that touch the image, nearest first."""
+def _project(gaussians: GaussianArrays, view: View, pool: ThreadPoolExecutor) -> np.ndarray:
+    """The splats that touch the image, nearest first, SPLAT [splats]."""
     count = len(gaussians.means)
-    splats = Splats.allocate(count)
+    splats = np.zeros(count, SPLAT)
     list(pool.map(lambda start: _kernels().project(gaussians, start, view, splats), range(0, count, BLOCK_SIZE)))
-    touching = np.flatnonzero(splats.rows)
-    return splats.select(touching[_argsort_depth(splats.features[touching, 3])])
+    touching = np.flatnonzero(splats["rows"])
+    return splats.take(touching[_argsort_depth(splats["features"][touching, 3])])
 
 
 def _argsort_depth(depth: np.ndarray) -> np.ndarray:

@@ -5,14 +5,13 @@ operations, and take the constants from there.
 """
 
 from math import ceil, exp, log
-from typing import Any
 
 import numpy as np
 
 from ..geometry.projection import DISC_STD, EPS2D, FOV_MARGIN
 from ..geometry.sh import SH_0, SH_1, SH_2, SH_3
 from ..system.compilation import compiled, compiling
-from .types import BLOCK_SIZE, MAX_ALPHA, MIN_ALPHA, MIN_LOG_TRANSMITTANCE, GaussianArrays, Splats, View
+from .types import BLOCK_SIZE, MAX_ALPHA, MIN_ALPHA, MIN_LOG_TRANSMITTANCE, SPLAT, GaussianArrays, View
 
 # Alpha is float32, as in NumPy's version: at a limit both must decide alike.
 MIN_ALPHA_32, MAX_ALPHA_32 = np.float32(MIN_ALPHA), np.float32(MAX_ALPHA)
@@ -32,22 +31,21 @@ def compile_all() -> None:
     arrays = (np.array([[0, 0, 1]]), np.ones((1, 4)), np.ones((1, 3)), np.ones(1), np.zeros((1, 1, 3)))
     gaussian = GaussianArrays(*(array.astype(np.float32) for array in arrays))
     with compiling(fill_rotation, "the rasteriser"):
-        splats = Splats.allocate(1)
+        splats = np.zeros(1, SPLAT)
         project(gaussian, 0, View(np.eye(4), np.eye(3), 1, 1, 0.01, 0.0, 1.0), splats)
         composite_band(splats, 0, 1, 1)
 
 
-def project(gaussians: GaussianArrays, start: int, view: View, splats: Splats) -> None:
-    """Fill the splats of the block of Gaussians from `start` on."""
-    block = slice(start, start + BLOCK_SIZE)
-    given: list[Any] = [*(field[block] for field in gaussians), *view, *(field[block] for field in splats)]
-    _project(*given)
+def project(gaussians: GaussianArrays, start: int, view: View, splats: np.ndarray) -> None:
+    """Fill the splats of the block of Gaussians from `start` on; splats: SPLAT [gaussians], zeros."""
+    block = GaussianArrays(*(field[start : start + BLOCK_SIZE] for field in gaussians))
+    _project(*(*block, *view), splats[start : start + BLOCK_SIZE])  # as one: mypy confuses two of different lengths
 
 
-def composite_band(splats: Splats, top: int, rows: int, width: int) -> np.ndarray:
+def composite_band(splats: np.ndarray, top: int, rows: int, width: int) -> np.ndarray:
     """Composited sums [rows, width, 5] of red, green, blue, depth and alpha, for the image rows from `top` on."""
     sums = np.zeros((rows, width, 5), np.float32)
-    _composite_band(*splats, top, sums)
+    _composite_band(splats, top, sums)
     return sums
 
 
@@ -65,19 +63,9 @@ def _project(
     near: float,
     aperture: float,
     focus: float,
-    splat_x: np.ndarray,
-    splat_y: np.ndarray,
-    splat_shear: np.ndarray,
-    splat_row_variance: np.ndarray,
-    splat_y_variance: np.ndarray,
-    splat_reach: np.ndarray,
-    opacity_scale: np.ndarray,
-    first_row: np.ndarray,
-    rows: np.ndarray,
-    columns: np.ndarray,
-    features: np.ndarray,
+    splats: np.ndarray,  # SPLAT [gaussians], zeros
 ) -> None:
-    """Fill the fields of `Splats`; a Gaussian that does not touch the image gets no rows."""
+    """Fill the splats of the Gaussians that touch the image."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     margin_x, margin_y = FOV_MARGIN * 0.5 * width / fx, FOV_MARGIN * 0.5 * height / fy
     position = np.empty(3)
@@ -92,7 +80,6 @@ def _project(
                 point[axis] += viewmat[axis, other] * means[index, other]
         z = point[2]
         if not (z > near and opacities[index] >= MIN_ALPHA_32):
-            rows[index] = 0
             continue
         slope_x, slope_y = point[0] / z, point[1] / z
         x, y = fx * slope_x + cx, fy * slope_y + cy
@@ -115,27 +102,27 @@ def _project(
         _, focused_row_variance = _shear_rows(xx, xy, yy)
         shear, row_variance = _shear_rows(x_variance, xy, y_variance)
         reach = np.log(np.float64(opacities[index] / MIN_ALPHA_32))
-        splat_x[index], splat_y[index], splat_shear[index] = x, y, shear
-        splat_row_variance[index], splat_y_variance[index], splat_reach[index] = row_variance, y_variance, reach
-        opacity_scale[index] = np.sqrt(min(focused_row_variance / row_variance * (yy / y_variance), 1.0))
-        first_row[index], rows[index] = _span(y, np.sqrt(2 * reach * y_variance), height)
-        _, columns[index] = _span(x, np.sqrt(2 * reach * x_variance), width)
-        if columns[index] == 0:
-            rows[index] = 0
-        if rows[index] == 0:
+        first_row, rows = _span(y, np.sqrt(2 * reach * y_variance), height)
+        _, columns = _span(x, np.sqrt(2 * reach * x_variance), width)
+        if rows == 0 or columns == 0:
             continue
+        splat = splats[index]
+        splat.x, splat.y, splat.shear = x, y, shear
+        splat.row_variance, splat.y_variance, splat.reach = row_variance, y_variance, reach
+        splat.opacity_scale = np.sqrt(min(focused_row_variance / row_variance * (yy / y_variance), 1.0))
+        splat.first_row, splat.rows, splat.columns = first_row, rows, columns
         _fill_basis(means[index], position, basis)
         for channel in range(3):
             colour = np.float32(0.5)
             for coefficient in range(len(basis)):
                 colour += basis[coefficient] * sh[index, coefficient, channel]
-            features[index, channel] = max(colour, np.float32(0))
-        features[index, 3] = z
+            splat.features[channel] = max(colour, np.float32(0))
+        splat.features[3] = z
 
 
 @_compiled
 def _shear_rows(xx: float, xy: float, yy: float) -> tuple[float, float]:
-    """shear and row_variance of a covariance, as in `Splats`."""
+    """shear and row_variance of a covariance, as in `SPLAT`."""
     shear = xy / yy
     return shear, max(xx - shear * shear * yy, EPS2D)
 
@@ -208,34 +195,24 @@ def _exp_of_falloff(x: np.float32) -> np.float32:
 
 @_compiled
 def _composite_band(
-    x: np.ndarray,
-    y: np.ndarray,
-    shear: np.ndarray,
-    row_variance: np.ndarray,
-    y_variance: np.ndarray,
-    reach: np.ndarray,
-    opacity_scale: np.ndarray,
-    first_row: np.ndarray,
-    rows: np.ndarray,
-    columns: np.ndarray,
-    features: np.ndarray,
+    splats: np.ndarray,  # SPLAT [splats], nearest first
     top: int,
     sums: np.ndarray,  # [band rows, width, 5]
 ) -> None:
-    """Composite the splats, nearest first, into the rows of the image from `top` on."""
+    """Composite the splats into the rows of the image from `top` on."""
     band_rows, width, _ = sums.shape
     transmittance = np.ones((band_rows, width))
     still_open = band_rows * width
-    for splat in range(len(x)):
-        first_inside, end = max(first_row[splat], top), min(first_row[splat] + rows[splat], top + band_rows)
+    for index in range(len(splats)):
+        splat = splats[index]
+        first_inside, end = max(splat.first_row, top), min(splat.first_row + splat.rows, top + band_rows)
         if first_inside >= end:
             continue
-        # Read once: for the compiler, what is written below could change the arrays.
-        centre_x, centre_y, slant = x[splat], y[splat], shear[splat]
-        variance, variance_y, reach_peak = row_variance[splat], y_variance[splat], reach[splat]
-        scale, sharpness = np.float32(opacity_scale[splat]), np.float32(np.sqrt(0.5 / variance))
-        per_row = 0.5 / variance_y
-        red, green, blue, depth = features[splat, 0], features[splat, 1], features[splat, 2], features[splat, 3]
+        # Read once: for the compiler, what is written below could change the splats.
+        centre_x, centre_y, slant = splat.x, splat.y, splat.shear
+        variance, per_row, reach_peak = splat.row_variance, 0.5 / splat.y_variance, splat.reach
+        scale, sharpness = np.float32(splat.opacity_scale), np.float32(np.sqrt(0.5 / variance))
+        red, green, blue, depth = splat.features[0], splat.features[1], splat.features[2], splat.features[3]
         for row in range(first_inside, end):
             dy = row + 0.5 - centre_y
             reach_here = max(reach_peak - dy * dy * per_row, 0.0)

@@ -8,27 +8,26 @@ import numpy as np
 
 from ..geometry.projection import EPS2D, defocus_variances, project_gaussians
 from ..geometry.sh import sh_basis
-from .types import BLOCK_SIZE, MAX_ALPHA, MIN_ALPHA, MIN_LOG_TRANSMITTANCE, GaussianArrays, Splats, View
+from .types import BLOCK_SIZE, MAX_ALPHA, MIN_ALPHA, MIN_LOG_TRANSMITTANCE, SPLAT, GaussianArrays, View
 
 CHUNK_FRAGMENTS = 1 << 18  # composited at once: the temporaries of a chunk fit the cache
 
 
-def project(gaussians: GaussianArrays, start: int, view: View, splats: Splats) -> None:
-    """Fill the splats of the block of Gaussians from `start` on."""
+def project(gaussians: GaussianArrays, start: int, view: View, splats: np.ndarray) -> None:
+    """Fill the splats of the block of Gaussians from `start` on; splats: SPLAT [gaussians], zeros."""
     block = GaussianArrays(*(field[start : start + BLOCK_SIZE] for field in gaussians))
     camera_means = block.means @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]  # [block, 3]
     visible = np.flatnonzero((camera_means[:, 2] > view.near) & (block.opacities >= MIN_ALPHA))
     camera_means, block = camera_means[visible], GaussianArrays(*(field[visible] for field in block))
 
     seen = _ellipses(camera_means, block, view)
-    seen.features[:, :3] = _colours(block.means, block.sh, view.viewmat)
-    seen.features[:, 3] = camera_means[:, 2]
-    for field, values in zip(splats, seen, strict=True):
-        field[start + visible] = values
+    seen["features"][:, :3] = _colours(block.means, block.sh, view.viewmat)
+    seen["features"][:, 3] = camera_means[:, 2]
+    splats[start + visible] = seen
 
 
-def _ellipses(camera_means: np.ndarray, gaussians: GaussianArrays, view: View) -> Splats:
-    """The 2D Gaussians in the image, with the box that alpha >= MIN_ALPHA fits in. `features` is left to the caller.
+def _ellipses(camera_means: np.ndarray, gaussians: GaussianArrays, view: View) -> np.ndarray:
+    """The splats, with the box that alpha >= MIN_ALPHA fits in. `features` is left to the caller.
 
     camera_means: means in the camera frame, [splats, 3].
     """
@@ -41,18 +40,19 @@ def _ellipses(camera_means: np.ndarray, gaussians: GaussianArrays, view: View) -
     _, focused_row_variance = _shear_rows(xx, xy, yy)
     shear, row_variance = _shear_rows(x_variance, xy, y_variance)
     # row_variance * y_variance is the determinant of the covariance.
-    opacity_scale = np.sqrt(np.minimum(focused_row_variance / row_variance * (yy / y_variance), 1))
-
-    reach = np.log(gaussians.opacities / MIN_ALPHA, dtype=np.float64)
-    first_row, rows = _span(y, np.sqrt(2 * reach * y_variance), view.height)
-    _, columns = _span(x, np.sqrt(2 * reach * x_variance), view.width)
-    rows[columns == 0] = 0
-    features = np.empty((len(camera_means), 4), np.float32)
-    return Splats(x, y, shear, row_variance, y_variance, reach, opacity_scale, first_row, rows, columns, features)
+    splats = np.zeros(len(camera_means), SPLAT)
+    splats["opacity_scale"] = np.sqrt(np.minimum(focused_row_variance / row_variance * (yy / y_variance), 1))
+    splats["x"], splats["y"], splats["shear"] = x, y, shear
+    splats["row_variance"], splats["y_variance"] = row_variance, y_variance
+    splats["reach"] = reach = np.log(gaussians.opacities / MIN_ALPHA, dtype=np.float64)
+    splats["first_row"], rows = _span(y, np.sqrt(2 * reach * y_variance), view.height)
+    _, splats["columns"] = _span(x, np.sqrt(2 * reach * x_variance), view.width)
+    splats["rows"] = np.where(splats["columns"] > 0, rows, 0)
+    return splats
 
 
 def _shear_rows(xx: np.ndarray, xy: np.ndarray, yy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """shear and row_variance of covariances, as in `Splats`."""
+    """shear and row_variance of covariances, as in `SPLAT`."""
     shear = xy / yy
     # At least EPS2D in exact arithmetic; the difference of two large numbers may be less.
     return shear, np.maximum(xx - shear * shear * yy, EPS2D)
@@ -74,13 +74,14 @@ def _colours(means: np.ndarray, sh: np.ndarray, viewmat: np.ndarray) -> np.ndarr
     return np.maximum(np.einsum("nk,nkc->nc", basis, sh) + np.float32(0.5), 0)
 
 
-def composite_band(splats: Splats, top: int, rows: int, width: int) -> np.ndarray:
+def composite_band(splats: np.ndarray, top: int, rows: int, width: int) -> np.ndarray:
     """Composited sums [rows, width, 5] of red, green, blue, depth and alpha, for the image rows from `top` on."""
-    last_row = splats.first_row + splats.rows
-    splats = splats.select(np.flatnonzero((splats.first_row < top + rows) & (last_row > top)))
-    first_row = np.maximum(splats.first_row, top)
-    last_row = np.minimum(splats.first_row + splats.rows, top + rows)
-    splats = splats._replace(y=splats.y - top, first_row=first_row - top, rows=last_row - first_row)
+    first_row, end_row = splats["first_row"], splats["first_row"] + splats["rows"]
+    splats = splats.take(np.flatnonzero((first_row < top + rows) & (end_row > top)))
+    first_row = np.maximum(splats["first_row"], top)
+    end_row = np.minimum(splats["first_row"] + splats["rows"], top + rows)
+    splats["y"] -= top
+    splats["first_row"], splats["rows"] = first_row - top, end_row - first_row
 
     sums = np.zeros((rows * width, 5), np.float32)
     log_transmittance = np.zeros(rows * width)  # includes the first fragment that was skipped, which ends the pixel
@@ -90,18 +91,18 @@ def composite_band(splats: Splats, top: int, rows: int, width: int) -> np.ndarra
             break
         fragments = _fragments(chunk, width, is_open)
         if len(fragments.pixel):
-            _composite(fragments, chunk.features, sums, log_transmittance)
+            _composite(fragments, chunk["features"], sums, log_transmittance)
     return sums.reshape(rows, width, 5)
 
 
-def _chunks(splats: Splats) -> Iterator[Splats]:
+def _chunks(splats: np.ndarray) -> Iterator[np.ndarray]:
     """Runs of consecutive splats whose boxes have CHUNK_FRAGMENTS pixels at most."""
-    box_pixels = np.cumsum(splats.rows * splats.columns)
+    box_pixels = np.cumsum(splats["rows"] * splats["columns"])
     start, spent = 0, 0
     while start < len(box_pixels):
         stop = int(np.searchsorted(box_pixels, spent + CHUNK_FRAGMENTS, side="right"))
         stop = max(stop, start + 1)
-        yield splats.select(slice(start, stop))
+        yield splats[start:stop]
         start, spent = stop, int(box_pixels[stop - 1])
 
 
@@ -113,14 +114,14 @@ class _Fragments(NamedTuple):
     alpha: np.ndarray  # float32
 
 
-def _fragments(splats: Splats, width: int, is_open: np.ndarray) -> _Fragments:
+def _fragments(splats: np.ndarray, width: int, is_open: np.ndarray) -> _Fragments:
     """The fragments of these splats at open pixels, `is_open` [pixels]."""
-    owner, row = _expand(splats.rows)  # [rows]
-    row += splats.first_row[owner]
-    dy = row + 0.5 - splats.y[owner]
-    reach = np.maximum(splats.reach[owner] - dy * dy * (0.5 / splats.y_variance)[owner], 0)
-    row_variance = splats.row_variance[owner]
-    centre = splats.x[owner] + splats.shear[owner] * dy
+    owner, row = _expand(splats["rows"])  # [rows]
+    row += splats["first_row"][owner]
+    dy = row + 0.5 - splats["y"][owner]
+    reach = np.maximum(splats["reach"][owner] - dy * dy * (0.5 / splats["y_variance"])[owner], 0)
+    row_variance = splats["row_variance"][owner]
+    centre = splats["x"][owner] + splats["shear"][owner] * dy
     first, length = _span(centre, np.sqrt(2 * reach * row_variance), width)
 
     any_closed = not is_open.all()
@@ -131,7 +132,7 @@ def _fragments(splats: Splats, width: int, is_open: np.ndarray) -> _Fragments:
     distance = (first + 0.5 - centre).astype(np.float32)
     sharpness = np.sqrt(0.5 / row_variance).astype(np.float32)
     log_peak = (reach + log(MIN_ALPHA)).astype(np.float32)
-    opacity_scale = splats.opacity_scale[owner].astype(np.float32)
+    opacity_scale = splats["opacity_scale"][owner].astype(np.float32)
 
     row, column = _expand(length)  # [fragments]
     falloff = (distance[row] + column.astype(np.float32)) * sharpness[row]

@@ -61,34 +61,27 @@ class View(NamedTuple):
     focus: float  # z-depth of the plane in focus, world units
 
 
-class Splats(NamedTuple):
-    """Projected Gaussians, in pixels. All [splats], float64 unless said otherwise. One that is not seen has no rows.
-
-    An ellipse is evaluated row by row. On the row at distance dy from the centre, the 2D Gaussian with covariance
-    (xx, xy, yy) is a 1D Gaussian centred at x + shear * dy, shear = xy / yy, with the variance xx - xy^2 / yy
-    (row_variance), and its exponent is lower by dy^2 / (2 yy).
-    """
-
-    x: np.ndarray
-    y: np.ndarray
-    shear: np.ndarray
-    row_variance: np.ndarray
-    y_variance: np.ndarray
-    reach: np.ndarray  # log(opacity / MIN_ALPHA): how far the exponent may fall before alpha is below MIN_ALPHA
-    opacity_scale: np.ndarray  # area of the ellipse in focus / area of this one, at most 1
-    first_row: np.ndarray  # int64
-    rows: np.ndarray  # int64; 0 where the splat does not touch the image
-    columns: np.ndarray  # int64, width of the bounding box of the ellipse
-    features: np.ndarray  # [splats, 4] float32: red, green, blue, depth
-
-    @staticmethod
-    def allocate(count: int) -> "Splats":
-        """Room for so many; none touches the image before it is filled."""
-        ellipses, spans = np.empty((7, count)), np.zeros((3, count), np.int64)
-        return Splats._make([*ellipses, *spans, np.empty((count, 4), np.float32)])
-
-    def select(self, index: np.ndarray | slice) -> "Splats":
-        """The splats at these indices, in this order."""
-        if isinstance(index, slice):
-            return Splats(*(field[index] for field in self))
-        return Splats(*(field.take(index, axis=0) for field in self))
+# A projected Gaussian, in pixels. One array holds all fields, so that a splat lies in two lines of the cache, and
+# sorting copies it as a whole.
+#
+# An ellipse is evaluated row by row. On the row at distance dy from the centre, the 2D Gaussian with covariance
+# (xx, xy, yy) is a 1D Gaussian centred at x + shear * dy, shear = xy / yy, with the variance xx - xy^2 / yy
+# (row_variance), and its exponent is lower by dy^2 / (2 yy).
+SPLAT = np.dtype(
+    [
+        ("x", np.float64),
+        ("y", np.float64),
+        ("shear", np.float64),
+        ("row_variance", np.float64),
+        ("y_variance", np.float64),
+        (
+            "reach",
+            np.float64,
+        ),  # log(opacity / MIN_ALPHA): how far the exponent may fall before alpha is below MIN_ALPHA
+        ("opacity_scale", np.float64),  # area of the ellipse in focus / area of this one, at most 1
+        ("first_row", np.int64),
+        ("rows", np.int64),  # 0 where the splat does not touch the image
+        ("columns", np.int64),  # width of the bounding box of the ellipse
+        ("features", np.float32, 4),  # red, green, blue, depth
+    ]
+)

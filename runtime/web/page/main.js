@@ -21,8 +21,9 @@ async function prepare() {
     console.warn("without a service worker the page needs the network, and has one thread:", error);
     return;
   }
-  // The worker isolates the page from the next load on.
-  if (!globalThis.crossOriginIsolated && !sessionStorage.getItem(RELOADED)) {
+  // The worker isolates the page from the next load on; files that were chosen meanwhile would be lost with a reload.
+  const chosen = state.images.length + state.cameraFiles.length > 0;
+  if (!globalThis.crossOriginIsolated && !chosen && !sessionStorage.getItem(RELOADED)) {
     sessionStorage.setItem(RELOADED, "yes");
     location.reload();
   }

@@ -4,8 +4,10 @@ import base64
 import io
 import json
 import struct
+import threading
 import zlib
 from collections.abc import Callable
+from http.server import SimpleHTTPRequestHandler
 from pathlib import Path
 
 import cv2
@@ -26,7 +28,7 @@ from idesplat.runtime.splats.io import read_splats
 from idesplat.runtime.web import third_party
 from PIL import Image
 from shared_fixtures import build_once
-from web_page import check_equal, download, drop, finished, opened, reconstruct, serving
+from web_page import StaticHost, check_equal, download, drop, finished, opened, reconstruct, serving
 
 pytestmark = pytest.mark.slow
 
@@ -36,6 +38,7 @@ MAX_ROTATION_DEG, MAX_SHIFT = 0.5, 0.02
 FOCAL_MM = 29  # of these images, rounded
 # The viewer sorts the splats in the background.
 TRIES, BETWEEN_MS = 60, 500
+WAIT_S = 60
 
 
 @pytest.fixture(scope="module")
@@ -257,6 +260,28 @@ def huge_png(path: Path) -> Path:
     chunk = struct.pack(">I", len(header) - 4) + header + struct.pack(">I", zlib.crc32(header))
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk)
     return path
+
+
+def test_files_chosen_before_the_service_worker_is_ready_stay(browser, site, captured, monkeypatch):
+    ready = threading.Event()
+
+    def hold_worker(self) -> None:
+        if self.path.startswith("/service-worker.js"):
+            ready.wait(WAIT_S)
+        SimpleHTTPRequestHandler.do_GET(self)
+
+    monkeypatch.setattr(StaticHost, "do_GET", hold_worker)
+    page = browser.new_page()
+    with serving(site) as (address, _):
+        page.goto(address)
+        page.wait_for_function("document.getElementById('environment').textContent !== ''")
+        page.set_input_files("#files", files_of(captured))
+        ready.set()
+        page.evaluate("navigator.serviceWorker.ready.then(() => null)")
+        page.wait_for_timeout(BETWEEN_MS)
+        assert page.locator("#chosen li").count() == 3
+        assert page.is_enabled("#start")
+    page.close()
 
 
 def test_wrong_files_are_answered(browser, site, captured, tmp_path):
