@@ -25,7 +25,7 @@ from .gaussians import Gaussians
 from .merging import covariances, ellipsoids
 from .surfaces import Surfaces, project_to_pixel
 
-SHARED_OPACITY = 0.65  # of its own, for a Gaussian of a surface that another view shows, too
+SHARED_OPACITY = 0.75  # of its own, for a Gaussian of a surface that another view shows, too
 
 
 def fit_to_surface(gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarray, view: int) -> Gaussians:
