@@ -1,7 +1,7 @@
 """The rasteriser's two expensive steps compiled by numba, one splat after another.
 
 They repeat the arithmetic of `rasterizer_numpy`, `geometry.projection` and `geometry.sh`, in the same order of
-operations, and take the constants from there.
+operations but for the exp of alpha, which comes from a table, and take the constants from there.
 """
 
 from math import ceil, exp, log
