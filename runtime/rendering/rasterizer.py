@@ -65,7 +65,7 @@ def rasterize(
     threads = min(MAX_THREADS, thread_count())
     kernels = _kernels()
     with ThreadPoolExecutor(threads) as pool:
-        splats = _project(gaussians, view, pool)
+        splats = _project(kernels, gaussians, view, pool)
 
         def render_band(top: int) -> None:
             sums[top : top + band_rows] = kernels.composite_band(splats, top, min(band_rows, height - top), width)
@@ -85,11 +85,11 @@ def _kernels() -> ModuleType:
     return rasterizer_numba
 
 
-def _project(gaussians: GaussianArrays, view: View, pool: ThreadPoolExecutor) -> np.ndarray:
+def _project(kernels: ModuleType, gaussians: GaussianArrays, view: View, pool: ThreadPoolExecutor) -> np.ndarray:
     """The splats that touch the image, nearest first, SPLAT [splats]."""
     count = len(gaussians.means)
     splats = np.zeros(count, SPLAT)
-    list(pool.map(lambda start: _kernels().project(gaussians, start, view, splats), range(0, count, BLOCK_SIZE)))
+    list(pool.map(lambda start: kernels.project(gaussians, start, view, splats), range(0, count, BLOCK_SIZE)))
     touching = np.flatnonzero(splats["rows"])
     return splats.take(touching[_argsort_depth(splats["features"][touching, 3])])
 

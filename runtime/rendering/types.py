@@ -74,10 +74,7 @@ SPLAT = np.dtype(
         ("shear", np.float64),
         ("row_variance", np.float64),
         ("y_variance", np.float64),
-        (
-            "reach",
-            np.float64,
-        ),  # log(opacity / MIN_ALPHA): how far the exponent may fall before alpha is below MIN_ALPHA
+        ("reach", np.float64),  # log(opacity / MIN_ALPHA): how far the exponent may fall until alpha is MIN_ALPHA
         ("opacity_scale", np.float64),  # area of the ellipse in focus / area of this one, at most 1
         ("first_row", np.int64),
         ("rows", np.int64),  # 0 where the splat does not touch the image

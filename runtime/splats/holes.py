@@ -27,7 +27,7 @@ def close_holes(gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarray) -> G
 def close_view(
     gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarray, view: int
 ) -> tuple[Gaussians, Gaussians, Gaussians]:
-    """Of one view, the kept Gaussians in the shapes of `fit_to_surface`, the continued background and the backdrop."""
+    """Of one view, the kept Gaussians as `fit_to_surface` gives them, the continued background and the backdrop."""
     pixels = kept[view].size
     own = gaussians.select(np.arange(pixels * view, pixels * (view + 1)))
     fitted = fit_to_surface(own, surfaces, kept, view)

@@ -22,8 +22,7 @@ async function prepare() {
     return;
   }
   // The worker isolates the page from the next load on; files that were chosen meanwhile would be lost with a reload.
-  const chosen = state.images.length + state.cameraFiles.length > 0;
-  if (!globalThis.crossOriginIsolated && !chosen && !sessionStorage.getItem(RELOADED)) {
+  if (!globalThis.crossOriginIsolated && !filesChosen() && !sessionStorage.getItem(RELOADED)) {
     sessionStorage.setItem(RELOADED, "yes");
     location.reload();
   }
@@ -42,6 +41,8 @@ async function describeEnvironment() {
 }
 
 // ---- files
+
+const filesChosen = () => state.images.length + state.cameraFiles.length > 0;
 
 function addFiles(files) {
   const { images, cameraFiles, others } = sortFiles(files);
@@ -65,7 +66,7 @@ function showFiles() {
   });
   element("chosen").replaceChildren(...items);
   const names = state.cameraFiles.map((file) => file.name).join(", ");
-  const chosen = state.images.length > 0 || names !== "";
+  const chosen = filesChosen();
   const cameras = names ? `Cameras: ${names}` : "No cameras: they are estimated from the images.";
   element("cameras").textContent = chosen ? `${state.images.length} images. ${cameras}` : "";
   element("focal-row").hidden = state.images.length === 0 || names !== "";
@@ -119,7 +120,7 @@ async function start() {
 function setRunning(running) {
   element("progress").hidden = !running;
   element("stop").hidden = !running;
-  element("start").disabled = running || state.images.length + state.cameraFiles.length === 0;
+  element("start").disabled = running || !filesChosen();
   element("clear").disabled = running;
 }
 
