@@ -2,9 +2,6 @@
 
 import numpy as np
 
-from .kernels import WEIGHT
-from .rasterizer import Pass
-
 
 class Contributions:
     """The sum of alpha T over the pixels of the views, one view a step, in rounds of all views.
@@ -22,12 +19,12 @@ class Contributions:
         latest = self._round if self._round.steps == self.views or not self._last.steps else self._last
         return np.where(latest.seen, latest.total, np.inf)
 
-    def add(self, done: Pass, gradients: np.ndarray) -> None:
-        """Add a view, from its pass and the gradients of its entries."""
+    def add(self, weights: np.ndarray, seen: np.ndarray) -> None:
+        """Add a view: the Gaussians' weights in it, and whether it has them in sight, both [gaussians]."""
         if self._round.steps == self.views:
             self._last, self._round = self._round, _Round(len(self._round.total))
-        self._round.total += np.bincount(done.gaussians, gradients[done.entries, WEIGHT], len(self._round.total))
-        self._round.seen |= done.boxes[:, 3] > done.boxes[:, 2]
+        self._round.total += weights
+        self._round.seen |= seen
         self._round.steps += 1
 
     def keep(self, chosen: np.ndarray) -> None:

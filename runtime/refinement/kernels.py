@@ -1,32 +1,29 @@
-"""The differentiable rasteriser compiled by numba: projection, compositing, and the way back to every parameter.
+"""Projection compiled by numba, and the way back from a projected Gaussian to every parameter.
 
-The forward arithmetic is that of `rendering` (EWA splatting, Zwicker et al. 2001, with the constants of gsplat). The
-image is divided into bands of rows. Each band has the list of Gaussians that reach it, nearest first; a Gaussian in a
-band is an entry. The backward pass writes one row of gradients for each entry, and each Gaussian sums its entries in a
-fixed order: no two threads write to one place, and the result does not depend on the number of threads.
+The forward arithmetic is that of `rendering` (EWA splatting, Zwicker et al. 2001, with the constants of gsplat).
 """
-
-from math import log
 
 import numpy as np
 
 from ..geometry.projection import EPS2D, FOV_MARGIN
 from ..geometry.sh import SH_1, SH_2, SH_3
 from ..rendering.rasterizer_numba import fill_rotation, fill_sh_basis
-from ..rendering.types import MAX_ALPHA, MIN_ALPHA
-from ..system.compilation import compiled
-
-BAND_ROWS = 16
-MIN_TRANSMITTANCE = 1e-4
-LOG_MIN_ALPHA = log(MIN_ALPHA)
-# Columns of a projected Gaussian.
-X, Y, CONIC_XX, CONIC_XY, CONIC_YY, OPACITY, RED, GREEN, BLUE, DEPTH = range(10)
-PROJECTED = 10
-# Columns of an entry's gradients: those of the projected Gaussian up to BLUE, and its weight in the image.
-WEIGHT = 9
-ENTRY = 10
-
-compiled_fast = compiled(fastmath={"contract", "arcp"})
+from ..rendering.types import MIN_ALPHA
+from .compositing import (
+    BAND_ROWS,
+    CONIC_XX,
+    CONIC_XY,
+    CONIC_YY,
+    DEPTH,
+    ENTRY,
+    LOG_MIN_ALPHA,
+    OPACITY,
+    RED,
+    WEIGHT,
+    X,
+    Y,
+    compiled_fast,
+)
 
 
 @compiled_fast
@@ -132,175 +129,6 @@ def project(
             for coefficient in range(len(basis)):
                 colour += basis[coefficient] * sh[index, coefficient, channel]
             out[RED + channel] = max(colour, 0.0)
-
-
-@compiled_fast
-def count_entries(boxes: np.ndarray, offsets: np.ndarray, bands: np.ndarray) -> int:
-    """Fill each Gaussian's first entry [gaussians] and each band's number of entries; the number of all entries."""
-    total = 0
-    for index in range(len(boxes)):
-        offsets[index] = total
-        if boxes[index, 3] > boxes[index, 2]:
-            for band in range(boxes[index, 2] // BAND_ROWS, (boxes[index, 3] - 1) // BAND_ROWS + 1):
-                bands[band] += 1
-                total += 1
-    return total
-
-
-@compiled_fast
-def list_entries(
-    order: np.ndarray,
-    boxes: np.ndarray,
-    offsets: np.ndarray,
-    starts: np.ndarray,
-    gaussians: np.ndarray,
-    entries: np.ndarray,
-) -> None:
-    """Fill the bands' lists, nearest Gaussian first: which Gaussian, and which entry of all."""
-    place = starts.copy()
-    for position in range(len(order)):
-        index = order[position]
-        first = boxes[index, 2] // BAND_ROWS
-        for band in range(first, (boxes[index, 3] - 1) // BAND_ROWS + 1):
-            gaussians[place[band]] = index
-            entries[place[band]] = offsets[index] + band - first
-            place[band] += 1
-
-
-@compiled_fast
-def _row_span(conic_xx: float, conic_xy: float, conic_yy: float, reach: float, dy: float) -> tuple[float, float]:
-    """The distances from the centre between which alpha can reach MIN_ALPHA on a row at distance dy from it."""
-    inside = conic_xy * conic_xy * dy * dy - conic_xx * (conic_yy * dy * dy - 2 * reach)
-    if inside <= 0:
-        return 1.0, 0.0
-    half, middle = np.sqrt(inside) / conic_xx, -conic_xy * dy / conic_xx
-    return middle - half, middle + half
-
-
-@compiled_fast
-def composite(
-    gaussians: np.ndarray,
-    start: int,
-    stop: int,
-    projected: np.ndarray,
-    boxes: np.ndarray,
-    band: int,
-    image: np.ndarray,  # [height, width, 3], zeros
-    transmittance: np.ndarray,  # [height, width], ones
-    last: np.ndarray,  # [height, width] int32, -1: the place of each pixel's last Gaussian in the list
-) -> None:
-    """Composite a band's list, front to back. A pixel is closed while its transmittance is negative."""
-    height, width = transmittance.shape
-    first_row, end_row = band * BAND_ROWS, min((band + 1) * BAND_ROWS, height)
-    for place in range(start, stop):
-        index = gaussians[place]
-        values = projected[index]
-        x, y, opacity = values[X], values[Y], values[OPACITY]
-        xx, xy, yy = values[CONIC_XX], values[CONIC_XY], values[CONIC_YY]
-        red, green, blue = values[RED], values[GREEN], values[BLUE]
-        reach = np.log(opacity) - np.float32(LOG_MIN_ALPHA)
-        left, right = boxes[index, 0], boxes[index, 1]
-        for row in range(max(boxes[index, 2], first_row), min(boxes[index, 3], end_row)):
-            dy = np.float32(row) + np.float32(0.5) - y
-            low, high = _row_span(xx, xy, yy, reach, dy)
-            begin = max(int(np.ceil(x + low - np.float32(0.5))), left)
-            end = min(int(np.floor(x + high - np.float32(0.5))) + 1, right)
-            for column in range(begin, end):
-                before = transmittance[row, column]
-                if before < 0:
-                    continue
-                dx = np.float32(column) + np.float32(0.5) - x
-                sigma = np.float32(0.5) * (xx * dx * dx + yy * dy * dy) + xy * dx * dy
-                alpha = min(np.float32(MAX_ALPHA), opacity * np.exp(-sigma))
-                if alpha < np.float32(MIN_ALPHA):
-                    continue
-                after = before * (np.float32(1) - alpha)
-                if after <= np.float32(MIN_TRANSMITTANCE):
-                    transmittance[row, column] = -before
-                    continue
-                weight = alpha * before
-                image[row, column, 0] += weight * red
-                image[row, column, 1] += weight * green
-                image[row, column, 2] += weight * blue
-                transmittance[row, column] = after
-                last[row, column] = place
-    for row in range(first_row, end_row):
-        for column in range(width):
-            transmittance[row, column] = abs(transmittance[row, column])
-
-
-@compiled_fast
-def composite_backward(
-    gaussians: np.ndarray,
-    entries: np.ndarray,
-    start: int,
-    stop: int,
-    projected: np.ndarray,
-    boxes: np.ndarray,
-    band: int,
-    transmittance: np.ndarray,
-    last: np.ndarray,
-    image_gradient: np.ndarray,  # [height, width, 3]
-    behind: np.ndarray,  # [height, width]: gradient of the transmittance times itself; overwritten
-    through: np.ndarray,  # [height, width]: the transmittance; overwritten
-    gradients: np.ndarray,  # [entries, ENTRY]
-) -> None:
-    """Write the gradients of a band's entries, back to front.
-
-    The transmittance before a Gaussian is that behind it divided by 1 - alpha. `behind` is the part of the loss's
-    derivative that comes from all behind the Gaussian at hand.
-    """
-    height = transmittance.shape[0]
-    first_row, end_row = band * BAND_ROWS, min((band + 1) * BAND_ROWS, height)
-    for place in range(stop - 1, start - 1, -1):
-        index = gaussians[place]
-        values = projected[index]
-        x, y, opacity = values[X], values[Y], values[OPACITY]
-        xx, xy, yy = values[CONIC_XX], values[CONIC_XY], values[CONIC_YY]
-        red, green, blue = values[RED], values[GREEN], values[BLUE]
-        reach = np.log(opacity) - np.float32(LOG_MIN_ALPHA)
-        left, right = boxes[index, 0], boxes[index, 1]
-        zero = np.float32(0)
-        for_x, for_y, for_xx, for_xy, for_yy = zero, zero, zero, zero, zero
-        for_opacity, for_red, for_green, for_blue, total = zero, zero, zero, zero, zero
-        for row in range(max(boxes[index, 2], first_row), min(boxes[index, 3], end_row)):
-            dy = np.float32(row) + np.float32(0.5) - y
-            low, high = _row_span(xx, xy, yy, reach, dy)
-            begin = max(int(np.ceil(x + low - np.float32(0.5))), left)
-            end = min(int(np.floor(x + high - np.float32(0.5))) + 1, right)
-            for column in range(begin, end):
-                if place > last[row, column]:
-                    continue
-                dx = np.float32(column) + np.float32(0.5) - x
-                sigma = np.float32(0.5) * (xx * dx * dx + yy * dy * dy) + xy * dx * dy
-                fall = np.exp(-sigma)
-                alpha = min(np.float32(MAX_ALPHA), opacity * fall)
-                if alpha < np.float32(MIN_ALPHA):
-                    continue
-                open_share = np.float32(1) / (np.float32(1) - alpha)
-                before = through[row, column] * open_share
-                weight = alpha * before
-                down = image_gradient[row, column]
-                for_red += weight * down[0]
-                for_green += weight * down[1]
-                for_blue += weight * down[2]
-                total += weight
-                worth = red * down[0] + green * down[1] + blue * down[2]
-                alpha_gradient = before * worth - behind[row, column] * open_share
-                behind[row, column] += weight * worth
-                through[row, column] = before
-                if opacity * fall >= np.float32(MAX_ALPHA):
-                    continue
-                for_opacity += fall * alpha_gradient
-                sigma_gradient = -alpha * alpha_gradient
-                for_xx += np.float32(0.5) * dx * dx * sigma_gradient
-                for_xy += dx * dy * sigma_gradient
-                for_yy += np.float32(0.5) * dy * dy * sigma_gradient
-                for_x -= (xx * dx + xy * dy) * sigma_gradient
-                for_y -= (yy * dy + xy * dx) * sigma_gradient
-        out = gradients[entries[place]]
-        out[X], out[Y], out[CONIC_XX], out[CONIC_XY], out[CONIC_YY] = for_x, for_y, for_xx, for_xy, for_yy
-        out[OPACITY], out[RED], out[GREEN], out[BLUE], out[WEIGHT] = for_opacity, for_red, for_green, for_blue, total
 
 
 @compiled_fast

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..system.compilation import compiling
 from ..system.threads import thread_count
-from . import kernels
+from . import compositing, kernels
 
 NEAR = 0.01  # world units
 MOST_THREADS = 8
@@ -57,14 +57,27 @@ class Pass:
 
     rgb: np.ndarray
     transmittance: np.ndarray
-    last: np.ndarray
     projected: np.ndarray
     boxes: np.ndarray
     offsets: np.ndarray
-    starts: np.ndarray
-    gaussians: np.ndarray
-    entries: np.ndarray
+    entries: "Entries"
     target: Target
+
+
+@dataclass(frozen=True, eq=False)
+class Entries:
+    """The entries of a pass and their fragments, as `compositing` describes them.
+
+    keys: sorted in each band. starts: each band's first entry, and the number of all. fragments: the same of its
+    fragments. ends: the fragment after an entry's last one. pixels, alphas: of the fragments.
+    """
+
+    keys: np.ndarray
+    starts: np.ndarray
+    fragments: np.ndarray
+    ends: np.ndarray
+    pixels: np.ndarray
+    alphas: np.ndarray
 
 
 def compile_all() -> None:
@@ -87,15 +100,16 @@ class GradientRasterizer:
 
     def __post_init__(self) -> None:
         self._pool = ThreadPoolExecutor(min(MOST_THREADS, thread_count()))
-        count = len(self.parameters)
-        self._projected = np.zeros((count, kernels.PROJECTED), self.parameters.means.dtype)
+        count, dtype = len(self.parameters), self.parameters.means.dtype
+        self._projected = np.zeros((count, compositing.PROJECTED), dtype)
         self._boxes = np.zeros((count, 4), np.int32)
         self._offsets = np.zeros(count, np.int64)
+        self._pixels, self._alphas = np.empty(0, np.int32), np.empty(0, dtype)
 
     def forward(self, target: Target) -> Pass:
         """Render a view. The pass is valid until the next one."""
         p, width, height = self.parameters, target.width, target.height
-        projected, boxes, offsets = self._projected, self._boxes, self._offsets
+        projected, boxes = self._projected, self._boxes
 
         def project(start: int, stop: int) -> None:
             kernels.project(
@@ -104,43 +118,58 @@ class GradientRasterizer:
             )  # fmt: skip
 
         self._over_gaussians(project)
-        bands = np.zeros(-(-height // kernels.BAND_ROWS), np.int64)
-        total = kernels.count_entries(boxes, offsets, bands)
-        starts = np.concatenate([[0], np.cumsum(bands)])
-        seen = np.flatnonzero(boxes[:, 3] > boxes[:, 2])
-        order = seen[np.argsort(projected[seen, kernels.DEPTH], kind="stable")]
-        gaussians, entries = np.empty(total, np.int32), np.empty(total, np.int64)
-        kernels.list_entries(order, boxes, offsets, starts, gaussians, entries)
+        e = self._entries(-(-height // compositing.BAND_ROWS))
         dtype = projected.dtype
         rgb, transmittance = np.zeros((height, width, 3), dtype), np.ones((height, width), dtype)
-        last = np.full((height, width), -1, np.int32)
 
         def composite(band: int) -> None:
-            kernels.composite(
-                gaussians, starts[band], starts[band + 1], projected, boxes, band, rgb, transmittance, last
-            )
+            start, stop = e.starts[band], e.starts[band + 1]
+            e.keys[start:stop].sort()
+            compositing.composite(
+                e.keys, start, stop, projected, boxes, band, e.fragments[band],
+                rgb, transmittance, e.ends, e.pixels, e.alphas,
+            )  # fmt: skip
 
-        self._over_bands(composite, len(bands))
-        return Pass(rgb, transmittance, last, projected, boxes, offsets, starts, gaussians, entries, target)
+        self._over_bands(composite, len(e.starts) - 1)
+        return Pass(rgb, transmittance, projected, boxes, self._offsets, e, target)
+
+    def _entries(self, bands: int) -> Entries:
+        """The entries of the projected Gaussians, unsorted, with room for their fragments."""
+        entries, pixels = np.zeros(bands, np.int64), np.zeros(bands, np.int64)
+        total = compositing.count_entries(self._boxes, self._offsets, entries, pixels)
+        starts, fragments = (np.concatenate([[0], np.cumsum(counts)]) for counts in (entries, pixels))
+        keys = np.empty(total, np.uint64)
+        depth_bits = self._projected[:, compositing.DEPTH].astype(np.float32).view(np.uint32).astype(np.uint64)
+        compositing.fill_keys(self._boxes, depth_bits, starts, keys)
+        if len(self._pixels) < fragments[-1]:  # kept from pass to pass: memory that was never used costs time
+            self._pixels = np.empty(fragments[-1], np.int32)
+            self._alphas = np.empty(fragments[-1], self._projected.dtype)
+        return Entries(keys, starts, fragments, np.empty(total, np.int64), self._pixels, self._alphas)
 
     def backward(self, done: Pass, for_rgb: np.ndarray, for_transmittance: np.ndarray | None = None) -> np.ndarray:
         """Gradients of the entries of a pass from those of its rgb and transmittance."""
-        behind = (
-            np.zeros_like(done.transmittance) if for_transmittance is None else for_transmittance * done.transmittance
-        )
-        dtype = done.rgb.dtype
-        through, gradients = done.transmittance.copy(), np.zeros((len(done.entries), kernels.ENTRY), dtype)
+        through = done.transmittance.flatten()
+        behind = np.zeros_like(through) if for_transmittance is None else for_transmittance.flatten() * through
+        e, dtype = done.entries, done.rgb.dtype
+        gradients = np.empty((len(e.keys), compositing.ENTRY), dtype)
         for_rgb = np.ascontiguousarray(for_rgb, dtype)
 
         def composite_backward(band: int) -> None:
-            start, stop = done.starts[band], done.starts[band + 1]
-            kernels.composite_backward(
-                done.gaussians, done.entries, start, stop, done.projected, done.boxes, band,
-                done.transmittance, done.last, for_rgb, behind, through, gradients,
+            compositing.composite_backward(
+                e.keys, e.starts[band], e.starts[band + 1], done.projected, done.boxes, band, e.fragments[band],
+                e.ends, e.pixels, e.alphas, done.offsets, for_rgb, behind, through, gradients,
             )  # fmt: skip
 
-        self._over_bands(composite_backward, len(done.starts) - 1)
+        self._over_bands(composite_backward, len(e.starts) - 1)
         return gradients
+
+    def weights(self, done: Pass, gradients: np.ndarray) -> np.ndarray:
+        """Each Gaussian's weight in the image, the sum of alpha T over the pixels, float64 [gaussians]."""
+        total = np.zeros(len(self.parameters))
+        self._over_gaussians(
+            lambda start, stop: compositing.add_weights(done.boxes, done.offsets, gradients, start, stop, total)
+        )
+        return total
 
     def parameter_gradients(self, done: Pass, gradients: np.ndarray) -> np.ndarray:
         """Gradients of the parameters from those of the entries, float64 [gaussians, columns]."""

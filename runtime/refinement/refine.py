@@ -126,7 +126,7 @@ class Optimiser:
         rendered = done.rgb * gain + offset
         loss = photometric_loss(rendered, view.image, view.weights, self.options.ssim_weight)
         gradients = self.rasterizer.backward(done, loss.gradient * gain)
-        self.contributions.add(done, gradients)
+        self._add_contributions(done, gradients)
         self.steps += 1
         if self.options.lr_poses:
             self._step_pose(index, self.rasterizer.pose_gradient(done, gradients), lr)
@@ -139,7 +139,7 @@ class Optimiser:
         if not self.steps:
             for view in progress(self.views, "finding what contributes"):
                 done = self.rasterizer.forward(view.target)
-                self.contributions.add(done, self.rasterizer.backward(done, np.zeros_like(done.rgb)))
+                self._add_contributions(done, self.rasterizer.backward(done, np.zeros_like(done.rgb)))
         total = self.contributions.total
         chosen = strongest(total, limit or len(total))
         if len(chosen) < len(total):
@@ -147,6 +147,9 @@ class Optimiser:
             self.moments = self.moments[chosen]
             self.contributions.keep(chosen)
             self.rasterizer = GradientRasterizer(self.parameters)
+
+    def _add_contributions(self, done: Pass, gradients: np.ndarray) -> None:
+        self.contributions.add(self.rasterizer.weights(done, gradients), done.boxes[:, 3] > done.boxes[:, 2])
 
     def _step_exposure(self, index: int, for_image: np.ndarray, rgb: np.ndarray, lr: float) -> None:
         """Adam on a view's gains and offsets. The mean over the views stays 1 and 0: else the scene would drift."""

@@ -1,0 +1,212 @@
+"""Compositing compiled by numba, front to back, and its backward pass over the fragments that it recorded.
+
+The image is divided into bands of rows. Each band has the list of Gaussians that reach it, nearest first; a Gaussian in
+a band is an entry. Forward, every pixel to which an entry contributes is recorded as a fragment, with its alpha.
+Backward, an entry's fragments give one row of gradients, and each Gaussian sums its entries in a fixed order: no two
+threads write to one place, and the result does not depend on the number of threads.
+"""
+
+from math import log
+
+import numpy as np
+
+from ..rendering.types import MAX_ALPHA, MIN_ALPHA
+from ..system.compilation import compiled
+
+BAND_ROWS = 16
+MIN_TRANSMITTANCE = 1e-4
+LOG_MIN_ALPHA = log(MIN_ALPHA)
+# Columns of a projected Gaussian.
+X, Y, CONIC_XX, CONIC_XY, CONIC_YY, OPACITY, RED, GREEN, BLUE, DEPTH = range(10)
+PROJECTED = 10
+# Columns of an entry's gradients: those of the projected Gaussian up to BLUE, and its weight in the image.
+WEIGHT = 9
+ENTRY = 10
+# A key of an entry: the bits of its depth, then the number of its Gaussian. Positive floats sort as their bits do.
+DEPTH_SHIFT, GAUSSIAN_MASK = np.uint64(32), np.uint64(0xFFFFFFFF)
+
+compiled_fast = compiled(fastmath={"contract", "arcp"})
+
+
+@compiled_fast
+def count_entries(
+    boxes: np.ndarray,
+    offsets: np.ndarray,  # [gaussians]: each one's first entry
+    entries: np.ndarray,  # [bands], zeros: how many there are
+    pixels: np.ndarray,  # [bands], zeros: in the boxes of the entries, and so at most as many fragments
+) -> int:
+    """Fill what the entries need; returns the number of all."""
+    total = 0
+    for index in range(len(boxes)):
+        offsets[index] = total
+        left, right, top, bottom = boxes[index, 0], boxes[index, 1], boxes[index, 2], boxes[index, 3]
+        if bottom <= top:
+            continue
+        for band in range(top // BAND_ROWS, (bottom - 1) // BAND_ROWS + 1):
+            entries[band] += 1
+            pixels[band] += (right - left) * (min(bottom, (band + 1) * BAND_ROWS) - max(top, band * BAND_ROWS))
+            total += 1
+    return total
+
+
+@compiled_fast
+def fill_keys(boxes: np.ndarray, depth_bits: np.ndarray, starts: np.ndarray, keys: np.ndarray) -> None:
+    """Fill the keys of all entries, band by band, unsorted. starts: each band's first place. depth_bits: uint64."""
+    place = starts.copy()
+    for index in range(len(boxes)):
+        top, bottom = boxes[index, 2], boxes[index, 3]
+        if bottom <= top:
+            continue
+        key = (depth_bits[index] << DEPTH_SHIFT) | np.uint64(index)
+        for band in range(top // BAND_ROWS, (bottom - 1) // BAND_ROWS + 1):
+            keys[place[band]] = key
+            place[band] += 1
+
+
+@compiled_fast
+def _row_span(conic_xx: float, conic_xy: float, conic_yy: float, reach: float, dy: float) -> tuple[float, float]:
+    """The distances from the centre between which alpha can reach MIN_ALPHA on a row at distance dy from it."""
+    inside = conic_xy * conic_xy * dy * dy - conic_xx * (conic_yy * dy * dy - 2 * reach)
+    if inside <= 0:
+        return 1.0, 0.0
+    half, middle = np.sqrt(inside) / conic_xx, -conic_xy * dy / conic_xx
+    return middle - half, middle + half
+
+
+@compiled_fast
+def composite(
+    keys: np.ndarray,  # [entries], sorted in each band
+    start: int,
+    stop: int,
+    projected: np.ndarray,
+    boxes: np.ndarray,
+    band: int,
+    fragment: int,
+    image: np.ndarray,  # [height, width, 3], zeros
+    transmittance: np.ndarray,  # [height, width], ones
+    ends: np.ndarray,  # [entries]: the fragment after an entry's last one
+    pixels: np.ndarray,  # [fragments] int32: row * width + column
+    alphas: np.ndarray,  # [fragments]
+) -> None:
+    """Composite the entries of a band from `start` to `stop`, and record their fragments from `fragment` on.
+
+    A pixel is closed while its transmittance is negative.
+    """
+    height, width = transmittance.shape
+    first_row, end_row = band * BAND_ROWS, min((band + 1) * BAND_ROWS, height)
+    for place in range(start, stop):
+        index = np.int64(keys[place] & GAUSSIAN_MASK)
+        values = projected[index]
+        x, y, opacity = values[X], values[Y], values[OPACITY]
+        xx, xy, yy = values[CONIC_XX], values[CONIC_XY], values[CONIC_YY]
+        red, green, blue = values[RED], values[GREEN], values[BLUE]
+        reach = np.log(opacity) - np.float32(LOG_MIN_ALPHA)
+        left, right = boxes[index, 0], boxes[index, 1]
+        for row in range(max(boxes[index, 2], first_row), min(boxes[index, 3], end_row)):
+            dy = np.float32(row) + np.float32(0.5) - y
+            low, high = _row_span(xx, xy, yy, reach, dy)
+            begin = max(int(np.ceil(x + low - np.float32(0.5))), left)
+            end = min(int(np.floor(x + high - np.float32(0.5))) + 1, right)
+            for column in range(begin, end):
+                before = transmittance[row, column]
+                if before < 0:
+                    continue
+                dx = np.float32(column) + np.float32(0.5) - x
+                sigma = np.float32(0.5) * (xx * dx * dx + yy * dy * dy) + xy * dx * dy
+                alpha = min(np.float32(MAX_ALPHA), opacity * np.exp(-sigma))
+                if alpha < np.float32(MIN_ALPHA):
+                    continue
+                after = before * (np.float32(1) - alpha)
+                if after <= np.float32(MIN_TRANSMITTANCE):
+                    transmittance[row, column] = -before
+                    continue
+                weight = alpha * before
+                image[row, column, 0] += weight * red
+                image[row, column, 1] += weight * green
+                image[row, column, 2] += weight * blue
+                transmittance[row, column] = after
+                pixels[fragment] = row * width + column
+                alphas[fragment] = alpha
+                fragment += 1
+        ends[place] = fragment
+    for row in range(first_row, end_row):
+        for column in range(width):
+            transmittance[row, column] = abs(transmittance[row, column])
+
+
+@compiled_fast
+def composite_backward(
+    keys: np.ndarray,
+    start: int,
+    stop: int,
+    projected: np.ndarray,
+    boxes: np.ndarray,
+    band: int,
+    fragment: int,
+    ends: np.ndarray,
+    pixels: np.ndarray,
+    alphas: np.ndarray,
+    offsets: np.ndarray,
+    image_gradient: np.ndarray,  # [height, width, 3]
+    behind: np.ndarray,  # [height * width]: gradient of the transmittance times itself; overwritten
+    through: np.ndarray,  # [height * width]: the transmittance; overwritten
+    gradients: np.ndarray,  # [entries, ENTRY]
+) -> None:
+    """Write the gradients of a band's entries, back to front.
+
+    The transmittance before a Gaussian is that behind it divided by 1 - alpha. `behind` is the part of the loss's
+    derivative that comes from all behind the Gaussian at hand. With G the gradient of sigma, the exponent of alpha,
+    those of centre and conic are sums of G, G dx, G dy, G dx dx and so on over the fragments.
+    """
+    width, zero = image_gradient.shape[1], np.float32(0)
+    for place in range(stop - 1, start - 1, -1):
+        index = np.int64(keys[place] & GAUSSIAN_MASK)
+        values = projected[index]
+        x, y = values[X], values[Y]
+        red, green, blue = values[RED], values[GREEN], values[BLUE]
+        for_red, for_green, for_blue, total = zero, zero, zero, zero
+        sum_g, sum_x, sum_y, sum_xx, sum_xy, sum_yy = zero, zero, zero, zero, zero, zero
+        for one in range(ends[place - 1] if place > start else fragment, ends[place]):
+            pixel, alpha = pixels[one], alphas[one]
+            row = pixel // width
+            column = pixel - row * width
+            open_share = np.float32(1) / (np.float32(1) - alpha)
+            before = through[pixel] * open_share
+            weight = alpha * before
+            down = image_gradient[row, column]
+            for_red += weight * down[0]
+            for_green += weight * down[1]
+            for_blue += weight * down[2]
+            total += weight
+            worth = red * down[0] + green * down[1] + blue * down[2]
+            g = behind[pixel] * open_share * alpha - weight * worth
+            behind[pixel] += weight * worth
+            through[pixel] = before
+            if alpha >= np.float32(MAX_ALPHA):
+                continue
+            dx = np.float32(column) + np.float32(0.5) - x
+            dy = np.float32(row) + np.float32(0.5) - y
+            sum_g += g
+            sum_x += g * dx
+            sum_y += g * dy
+            sum_xx += g * dx * dx
+            sum_xy += g * dx * dy
+            sum_yy += g * dy * dy
+        xx, xy, yy = values[CONIC_XX], values[CONIC_XY], values[CONIC_YY]
+        out = gradients[offsets[index] + band - boxes[index, 2] // BAND_ROWS]
+        out[X], out[Y] = -(xx * sum_x + xy * sum_y), -(yy * sum_y + xy * sum_x)
+        out[CONIC_XX], out[CONIC_XY], out[CONIC_YY] = np.float32(0.5) * sum_xx, sum_xy, np.float32(0.5) * sum_yy
+        out[OPACITY] = -sum_g / values[OPACITY]
+        out[RED], out[GREEN], out[BLUE], out[WEIGHT] = for_red, for_green, for_blue, total
+
+
+@compiled_fast
+def add_weights(
+    boxes: np.ndarray, offsets: np.ndarray, gradients: np.ndarray, start: int, stop: int, total: np.ndarray
+) -> None:
+    """Add the weights in the image of the Gaussians from `start` to `stop` to `total`, [gaussians] float64."""
+    for index in range(start, stop):
+        if boxes[index, 3] > boxes[index, 2]:
+            end = offsets[index] + (boxes[index, 3] - 1) // BAND_ROWS - boxes[index, 2] // BAND_ROWS + 1
+            for entry in range(offsets[index], end):
+                total[index] += gradients[entry, WEIGHT]
