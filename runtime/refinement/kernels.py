@@ -25,6 +25,8 @@ from .compositing import (
     compiled_fast,
 )
 
+EPSILON = 1e-15  # of Adam, as 3DGS has it
+
 
 @compiled_fast
 def _sh_gradient(x: float, y: float, z: float, worth: np.ndarray, gradient: np.ndarray) -> None:
@@ -144,7 +146,7 @@ def _gaussian_gradient(
     width: int,
     height: int,
     camera: np.ndarray,
-    work: np.ndarray,  # [4, 3, 3]
+    work: np.ndarray,  # [6, 3, 3]
     basis: np.ndarray,  # [2, coefficients]
     out: np.ndarray,  # [11 + 3 * coefficients]: mean, quat, log scale, logit, SH coefficients
 ) -> None:
@@ -152,7 +154,7 @@ def _gaussian_gradient(
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     margin_x, margin_y = FOV_MARGIN * 0.5 * width / fx, FOV_MARGIN * 0.5 * height / fy
     rotation, axes, for_axes = work[0], work[1], work[2]
-    rows, halves = work[3], np.empty((2, 3))
+    rows, halves, scales = work[3], work[4], work[5, 0]
     px, py, z = viewmat[0, 3], viewmat[1, 3], viewmat[2, 3]
     for axis in range(3):
         px += viewmat[0, axis] * mean[axis]
@@ -166,10 +168,10 @@ def _gaussian_gradient(
         rows[0, row] = fx / z * (viewmat[0, row] - across * viewmat[2, row])
         rows[1, row] = fy / z * (viewmat[1, row] - down * viewmat[2, row])
     for column in range(3):
-        scale = np.exp(np.float64(log_scale[column]))
+        scales[column] = np.exp(np.float64(log_scale[column]))
         halves[0, column], halves[1, column] = 0.0, 0.0
         for row in range(3):
-            axes[row, column] = rotation[row, column] * scale
+            axes[row, column] = rotation[row, column] * scales[column]
             halves[0, column] += rows[0, row] * axes[row, column]
             halves[1, column] += rows[1, row] * axes[row, column]
     # The inverse M of the covariance S: dL/dS = -M (dL/dM) M.
@@ -205,9 +207,8 @@ def _gaussian_gradient(
         for row in range(3):
             total += axes[row, column] * for_axes[row, column]
         out[7 + column] = total
-        scale = np.exp(np.float64(log_scale[column]))
         for row in range(3):
-            for_axes[row, column] *= scale
+            for_axes[row, column] *= scales[column]
     g = for_axes
     w, x, y, q = quat[0] / length, quat[1] / length, quat[2] / length, quat[3] / length
     gw = 2 * (x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + q * (g[1, 0] - g[0, 1]))
@@ -270,7 +271,7 @@ def parameter_gradients(
     out: np.ndarray,  # [gaussians, 11 + 3 * coefficients]
 ) -> None:
     """Fill the gradients of the parameters of the Gaussians from `start` to `stop`; zero for those not seen."""
-    camera, work, given = np.empty(3), np.empty((4, 3, 3)), np.empty(ENTRY)
+    camera, work, given = np.empty(3), np.empty((6, 3, 3)), np.empty(ENTRY)
     basis = np.empty((2, sh.shape[1]))
     for axis in range(3):
         camera[axis] = -np.sum(viewmat[:3, axis] * viewmat[:3, 3])
@@ -309,7 +310,7 @@ def pose_gradient(
     camera is moving all Gaussians the other way. Their SH turn with the world, so that the rotation changes no colour:
     what the means' gradients have of it, d x dL/dd of the viewing direction d, is taken away.
     """
-    camera, work, given = np.empty(3), np.zeros((4, 3, 3)), np.empty(ENTRY)
+    camera, work, given = np.empty(3), np.zeros((6, 3, 3)), np.empty(ENTRY)
     basis, gradient = np.empty((2, sh.shape[1])), np.empty(11 + 3 * sh.shape[1])
     for axis in range(3):
         camera[axis] = -np.sum(viewmat[:3, axis] * viewmat[:3, 3])
@@ -338,6 +339,21 @@ def pose_gradient(
 
 
 @compiled_fast
+def _adam_direction(
+    gradient: np.ndarray, moments: np.ndarray, beta_1: float, beta_2: float, correction: float
+) -> None:
+    """Update a Gaussian's moments [2, columns], and replace its gradient by their quotient, all float32."""
+    first, second = moments[0], moments[1]
+    keep_1, add_1 = np.float32(beta_1), np.float32(1 - beta_1)
+    keep_2, add_2 = np.float32(beta_2), np.float32(1 - beta_2)
+    for column in range(len(gradient)):
+        g = gradient[column]
+        first[column] = keep_1 * first[column] + add_1 * g
+        second[column] = keep_2 * second[column] + add_2 * g * g
+        gradient[column] = first[column] / (np.sqrt(second[column] * np.float32(correction)) + np.float32(EPSILON))
+
+
+@compiled_fast
 def adam_step(
     means: np.ndarray,
     quats: np.ndarray,
@@ -355,17 +371,15 @@ def adam_step(
     offsets: np.ndarray,
     gradients: np.ndarray,
     moments: np.ndarray,  # [gaussians, 2, 11 + 3 * coefficients] float32
-    lr: np.ndarray,  # [11 + 3 * coefficients]
+    lr: np.ndarray,  # [11 + 3 * coefficients] float32, over the bias correction of the first moments
     beta_1: float,
     beta_2: float,
-    epsilon: float,
-    correction_1: float,
-    correction_2: float,
+    correction: float,  # one over the bias correction of the second moments
 ) -> None:
     """One step of Adam on the Gaussians that this view sees (selective Adam); no gradient is stored."""
-    camera, work, given = np.empty(3), np.empty((4, 3, 3)), np.empty(ENTRY)
+    camera, work, given = np.empty(3), np.empty((6, 3, 3)), np.empty(ENTRY)
     basis = np.empty((2, sh.shape[1]))
-    gradient = np.empty(11 + 3 * sh.shape[1])
+    gradient = np.empty(11 + 3 * sh.shape[1], np.float32)
     for axis in range(3):
         camera[axis] = -np.sum(viewmat[:3, axis] * viewmat[:3, 3])
     for index in range(start, stop):
@@ -378,19 +392,14 @@ def adam_step(
             means[index], quats[index], log_scales[index], sh[index], projected[index], given,
             viewmat, K, width, height, camera, work, basis, gradient,
         )  # fmt: skip
-        first, second = moments[index, 0], moments[index, 1]
-        for column in range(len(gradient)):
-            g = np.float32(gradient[column])
-            first[column] = np.float32(beta_1) * first[column] + np.float32(1 - beta_1) * g
-            second[column] = np.float32(beta_2) * second[column] + np.float32(1 - beta_2) * g * g
-            root = np.sqrt(second[column] * np.float32(correction_2)) + np.float32(epsilon)
-            gradient[column] = lr[column] * first[column] * np.float32(correction_1) / root
+        _adam_direction(gradient, moments[index], beta_1, beta_2, correction)
         for axis in range(3):
-            means[index, axis] -= gradient[axis]
-            log_scales[index, axis] -= gradient[7 + axis]
+            means[index, axis] -= lr[axis] * gradient[axis]
+            log_scales[index, axis] -= lr[7 + axis] * gradient[7 + axis]
         for axis in range(4):
-            quats[index, axis] -= gradient[3 + axis]
-        logits[index] -= gradient[10]
+            quats[index, axis] -= lr[3 + axis] * gradient[3 + axis]
+        logits[index] -= lr[10] * gradient[10]
         for coefficient in range(sh.shape[1]):
             for channel in range(3):
-                sh[index, coefficient, channel] -= gradient[11 + 3 * coefficient + channel]
+                column = 11 + 3 * coefficient + channel
+                sh[index, coefficient, channel] -= lr[column] * gradient[column]

@@ -13,7 +13,7 @@ from . import compositing, kernels
 NEAR = 0.01  # world units
 MOST_THREADS = 8
 BLOCK = 1 << 13  # Gaussians of one task
-BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15  # of Adam, as 3DGS has them
+BETA_1, BETA_2 = 0.9, 0.999  # of Adam, as 3DGS has them
 
 
 @dataclass(eq=False)
@@ -210,13 +210,13 @@ class GradientRasterizer:
     ) -> None:
         """One step of Adam, the `count`-th (from 1), on the Gaussians that the pass saw."""
         p, target = self.parameters, done.target
-        corrections = 1 / (1 - BETA_1**count), 1 / (1 - BETA_2**count)
+        rates, correction = (lr / (1 - BETA_1**count)).astype(np.float32), 1 / (1 - BETA_2**count)
 
         def adam_step(start: int, stop: int) -> None:
             kernels.adam_step(
                 p.means, p.quats, p.log_scales, p.logits, p.sh, target.viewmat, target.K, target.width, target.height,
-                start, stop, done.projected, done.boxes, done.offsets, gradients, moments, lr,
-                BETA_1, BETA_2, EPSILON, *corrections,
+                start, stop, done.projected, done.boxes, done.offsets, gradients, moments, rates,
+                BETA_1, BETA_2, correction,
             )  # fmt: skip
 
         self._over_gaussians(adam_step)

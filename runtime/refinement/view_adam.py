@@ -4,7 +4,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from .rasterizer import BETA_1, BETA_2, EPSILON
+from .kernels import EPSILON
+from .rasterizer import BETA_1, BETA_2
 
 
 @dataclass(eq=False)
