@@ -47,11 +47,17 @@ CURRICULUM = (
 
 
 def training_phases(objective: Objective, curriculum: bool) -> tuple[Phase, ...]:
-    """The phases of a run; the photometric objective has a single one, since it does not supervise depth."""
+    """The phases of a run; the photometric objective has a single one, since it does not supervise depth.
+
+    The depth objective has those that predict no Gaussians, each for a larger share of the steps.
+    """
     rendered = objective is not Objective.DEPTH
     if not curriculum or objective is Objective.PHOTOMETRIC:
         return (Phase(1.0, dpbus=3, gaussians=rendered, downsample=1),)
-    return tuple(replace(phase, gaussians=phase.gaussians and rendered) for phase in CURRICULUM)
+    if rendered:
+        return CURRICULUM
+    depth_phases = [phase for phase in CURRICULUM if not phase.gaussians]
+    return tuple(replace(phase, end=phase.end / depth_phases[-1].end) for phase in depth_phases)
 
 
 def phase_at(phases: tuple[Phase, ...], step: int, steps: int) -> Phase:

@@ -6,11 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from ...model.checkpoint import CheckpointError, fill, read_state_dict
 from ...model.idesplat.config import IDESplatConfig
+from ...model.idesplat.keys import rename_released
 from ...model.idesplat.network import IDESplat
 from ...runtime.errors import InputError
 from ...runtime.system.files import atomic_write, check_regular
@@ -33,6 +34,9 @@ RENAMED_SETTINGS = {"gradual": "curriculum"}
 DEFAULT_SETTINGS = {field.name: field.default for field in fields(TrainingSettings) if field.default is not MISSING}
 # A part that older checkpoints lack; newly initialised, it is an identity.
 OPTIONAL_PREFIX = "gaussians.cross_view."
+# The monocular branch: a network with EfficientNet-Lite0 can start from one with a ViT.
+PHOTO_PREFIX, VIT_BRANCH_PREFIXES = "encoder.photo.", ("encoder.vit.", "encoder.dpt.")
+MERGE_WEIGHTS = {f"dpbu{number}.merge.conv.weight" for number in (1, 2, 3)}
 
 
 class TrainingState:
@@ -61,9 +65,7 @@ class TrainingState:
     def start_from(self, path: Path) -> None:
         """Load the weights of a checkpoint, released or own; raises InputError if it does not fit the network."""
         try:
-            tensors = read_state_dict(path)
-            made = self.model.state_dict()
-            fill(self.model, {name: made[name] for name in made if name.startswith(OPTIONAL_PREFIX)} | tensors, path)
+            fill(self.model, _with_missing_parts(rename_released(read_state_dict(path)), self.model), path)
         except CheckpointError as error:
             raise InputError(str(error)) from None
         self.reset_ema()
@@ -134,3 +136,20 @@ class TrainingState:
         self.optimizer.load_state_dict(training["optimizer"])
         self.ema = content["state_dict"]
         self.step = training["step"]
+
+
+def _with_missing_parts(tensors: dict[str, Tensor], model: IDESplat) -> dict[str, Tensor]:
+    """A checkpoint's tensors with the newly initialised ones of the parts that it lacks.
+
+    Where the monocular branch is replaced, the layers that merge its features start without them.
+    """
+    made = model.state_dict()
+    tensors = {name: made[name] for name in made if name.startswith(OPTIONAL_PREFIX)} | tensors
+    if model.encoder.photo is None or any(name.startswith(PHOTO_PREFIX) for name in tensors):
+        return tensors
+    kept = {name: value for name, value in tensors.items() if not name.startswith(VIT_BRANCH_PREFIXES)}
+    kept |= {name: made[name] for name in made if name.startswith(PHOTO_PREFIX)}
+    for name in kept.keys() & MERGE_WEIGHTS:
+        kept[name] = kept[name].clone()
+        kept[name][:, -sum(model.config.mono_channels) :] = 0
+    return kept

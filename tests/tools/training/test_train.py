@@ -17,7 +17,7 @@ import pytest
 import torch
 from idesplat.model.checkpoint import load_checkpoint
 from idesplat.model.config import DPTConfig, UNetConfig, ViTConfig
-from idesplat.model.idesplat.config import DPBUConfig, FocusConfig, IDESplatConfig
+from idesplat.model.idesplat.config import DPBUConfig, FocusConfig, IDESplatConfig, PhotoConfig
 from idesplat.model.idesplat.network import IDESplat
 from idesplat.model.registry import PRESETS
 from idesplat.runtime.cameras.camera import Camera
@@ -175,7 +175,9 @@ def test_curriculum_goes_from_coarse_to_fine_and_lr_decays() -> None:
     seen = [phase_at(phases, step, 100) for step in range(100)]
     assert seen[0].dpbus == 1 and seen[-1].dpbus == 3 and seen[-1].gaussians and seen[-1].downsample == 1
     assert [phase.dpbus for phase in seen] == sorted(phase.dpbus for phase in seen)
-    assert not any(phase.gaussians for phase in training_phases(Objective.DEPTH, curriculum=True))
+    depth = training_phases(Objective.DEPTH, curriculum=True)
+    assert not any(phase.gaussians for phase in depth) and depth[-1].dpbus == 3 and depth[-1].downsample == 1
+    assert depth[-1].end == 1 and depth[0].end == pytest.approx(0.57 / 0.87)
     assert training_phases(Objective.PHOTOMETRIC, curriculum=True) == (EVERYTHING,)
     rates = [lr_factor(phases, step, 1000) for step in range(1000)]
     peak = rates.index(max(rates))
@@ -428,3 +430,18 @@ def test_init_loads_weights_and_starts_at_step_zero(finished: Path) -> None:
     expected = load_checkpoint(finished / CHECKPOINT, SMALL).state_dict()
     assert state.step == 0
     assert all(torch.equal(value, expected[name]) for name, value in state.model.state_dict().items())
+
+
+def test_init_replaces_the_vit_by_photographic_features(finished: Path) -> None:
+    config = replace(SMALL, photo=PhotoConfig(channels=SMALL.vit.dim, features=SMALL.dpt.features))
+    state = TrainingState(config, seed=1, lr=1e-3, vit_lr=1e-3)
+    made = {name: value.clone() for name, value in state.model.state_dict().items()}
+    state.start_from(finished / CHECKPOINT)
+    kept = load_checkpoint(finished / CHECKPOINT, SMALL).state_dict()
+    merged = tuple(f"dpbu{number}.merge.conv.weight" for number in (1, 2, 3))
+    for name, value in state.model.state_dict().items():
+        if name in merged:
+            mono = sum(config.mono_channels)
+            assert torch.equal(value[:, :-mono], kept[name][:, :-mono]) and not value[:, -mono:].any()
+        else:
+            assert torch.equal(value, made[name] if name.startswith("encoder.photo.") else kept[name]), name
