@@ -20,8 +20,10 @@ if TYPE_CHECKING:
     from ..cameras.camera import Camera
     from ..refinement.refine import PosedImage
 
-STEPS_PER_VIEW = PRESETS[Quality.STANDARD].steps_per_view
-STEPS_HELP = f"Steps of the optimiser, one image each; else {STEPS_PER_VIEW} for each image."
+STANDARD = PRESETS[Quality.STANDARD]
+STEPS_HELP = (
+    f"Steps of the optimiser, one image each; else {STANDARD.steps_per_added_view} for each image beyond the first."
+)
 
 
 @command("idesplat refine")
@@ -78,7 +80,7 @@ def refine(
     with scratch_folder() as folder:
         found, views = _read_views(cameras, camera_format, images or [], offset, max_side, folder)
     options = RefinementOptions(
-        steps or STEPS_PER_VIEW * len(views),
+        steps or STANDARD.steps(len(views)),
         seed=seed,
         max_gaussians=max_gaussians,
         lr_poses=POSE_LR if refine_poses else 0,

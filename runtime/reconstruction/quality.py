@@ -37,26 +37,31 @@ class Preset:
     views: how many images are used where neither --views nor --select says it. pixels: least area of the images that
     the network gets; that of its training if larger. fuse: whether Gaussians that other views see through and surplus
     copies of a surface are removed, and holes closed.
-    steps_per_view, seconds: of the refinement, whichever ends first; no steps for none. The seconds are those of
-    `views` images, and grow with their number beyond. copy_side: longer side of the images that it fits, in pixels.
+    steps_per_added_view, seconds: of the refinement, whichever ends first; no steps for none. Steps count for each
+    image beyond the first: two images are soon overfitted, more are not. The seconds are those of `views` images, and
+    grow with their number beyond. copy_side: longer side of the images that it fits, in pixels.
     """
 
     views: int
     pixels: int
     fuse: bool
-    steps_per_view: int
+    steps_per_added_view: int
     seconds: float
     copy_side: int
 
+    def steps(self, views: int) -> int:
+        """Steps of the refinement on so many images, where its time does not end it."""
+        return self.steps_per_added_view * max(views - 1, 1)
+
     def limit(self, views: int) -> RefinementLimit:
         """When the refinement on so many images ends."""
-        return RefinementLimit(views * self.steps_per_view, self.seconds * max(1, views / self.views))
+        return RefinementLimit(self.steps(views), self.seconds * max(1, views / self.views))
 
 
 PRESETS = {
-    Quality.FAST: Preset(views=2, pixels=0, fuse=False, steps_per_view=0, seconds=inf, copy_side=COPY_SIDE),
-    Quality.STANDARD: Preset(views=8, pixels=0, fuse=True, steps_per_view=20, seconds=40, copy_side=COPY_SIDE),
-    Quality.HIGH: Preset(views=24, pixels=1 << 17, fuse=True, steps_per_view=30, seconds=180, copy_side=640),
+    Quality.FAST: Preset(views=2, pixels=0, fuse=False, steps_per_added_view=0, seconds=inf, copy_side=COPY_SIDE),
+    Quality.STANDARD: Preset(views=8, pixels=0, fuse=True, steps_per_added_view=40, seconds=40, copy_side=COPY_SIDE),
+    Quality.HIGH: Preset(views=24, pixels=1 << 17, fuse=True, steps_per_added_view=60, seconds=180, copy_side=640),
 }
 
 

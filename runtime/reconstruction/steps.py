@@ -35,7 +35,7 @@ class Plan:
     @property
     def copy_side(self) -> int:
         """The longer side of the images to refine on; 0 where there is nothing to do."""
-        steps = self.limit.steps if self.limit else self.preset.steps_per_view
+        steps = self.limit.steps if self.limit else self.preset.steps_per_added_view
         return self.preset.copy_side if self.gaussians and (steps or self.max_gaussians) else 0
 
     def refinement(self, views: int) -> RefinementOptions:

@@ -339,9 +339,7 @@ def pose_gradient(
 
 
 @compiled_fast
-def _adam_direction(
-    gradient: np.ndarray, moments: np.ndarray, beta_1: float, beta_2: float, correction: float
-) -> None:
+def _adam_direction(gradient: np.ndarray, moments: np.ndarray, beta_1: float, beta_2: float, correction: float) -> None:
     """Update a Gaussian's moments [2, columns], and replace its gradient by their quotient, all float32."""
     first, second = moments[0], moments[1]
     keep_1, add_1 = np.float32(beta_1), np.float32(1 - beta_1)

@@ -44,7 +44,9 @@ def test_refine_overrides_the_quality() -> None:
     for quality in ("fast", "high"):
         timed = plan(quality, "25s").refinement(6)
         assert timed.seconds == 25 and timed.steps == MAX_STEPS
-    assert plan("standard").refinement(6).steps == 6 * PRESETS[Quality.STANDARD].steps_per_view
+    per_added_view = PRESETS[Quality.STANDARD].steps_per_added_view
+    for views in (2, 6):
+        assert plan("standard").refinement(views).steps == (views - 1) * per_added_view
 
 
 def test_more_images_than_the_quality_takes_have_more_time() -> None:

@@ -70,7 +70,7 @@ def compare(
             case = CaptureImages(source, images, SIZE).case(context, targets, predictor.depth_range)
             scenes = {name: CaptureEvaluator(predictor, {}, plan).predict(case) for name, plan in plans.items()}
         predicted = scenes[Quality.FAST][0]
-        for count in steps or (views * plans[Quality.STANDARD].preset.steps_per_view,):
+        for count in steps or (plans[Quality.STANDARD].preset.steps(views),):
             scenes[f"OpenSplat, {count} steps"] = train_opensplat(opensplat, case, predicted, count)
         for name, (gaussians, seconds) in scenes.items():
             scores = _scores(gaussians, case)
