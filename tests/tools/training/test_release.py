@@ -1,0 +1,27 @@
+"""The bundled graph and the weights that are kept for it belong together."""
+
+import numpy as np
+import pytest
+import torch
+from idesplat.model.checkpoint import load_checkpoint
+from idesplat.runtime.inference.bundled_model import bundled_model
+from idesplat.runtime.inference.predictor import Predictor
+from idesplat.tools.synthetic.sampler import VALIDATION_SEEDS, generate_sample
+from idesplat.tools.training.release import WEIGHTS
+
+SIDE = 64
+TYPICAL = 1e-5  # median error that float32 explains
+
+
+@pytest.mark.slow
+def test_the_bundled_graph_computes_what_its_weights_do() -> None:
+    predictor = Predictor(bundled_model())
+    sample = generate_sample(VALIDATION_SEEDS[0], 2, 0, SIDE, SIDE)
+    views = sample.images, sample.extrinsics, sample.intrinsics
+    found = predictor.predict_arrays(*views, sample.near, sample.far)
+    near, far = (torch.full((2,), float(value)) for value in (sample.near, sample.far))
+    with torch.no_grad():
+        expected = load_checkpoint(WEIGHTS, predictor.metadata.preset)(*map(torch.from_numpy, views), near, far)
+    assert np.median(np.abs(found.depth / expected.depth.numpy() - 1)) < TYPICAL
+    opacities = expected.gaussians.opacities.numpy().ravel()
+    assert np.median(np.abs(found.need_gaussians().opacities - opacities)) < TYPICAL
