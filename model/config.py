@@ -38,13 +38,11 @@ class UNetConfig:
     channels: int
     levels: int
     heads: int = 4
-    # Side of the pixel blocks that become channels (pixel unshuffle): a large map of few channels is slow to convolve.
-    shuffle: int = 1
 
     @property
     def side(self) -> int:
         """Height and width of its maps must be multiples of this, to halve evenly."""
-        return self.shuffle * 2 ** (self.levels - 1)
+        return int(2 ** (self.levels - 1))
 
 
 @dataclass(frozen=True)

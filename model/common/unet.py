@@ -100,12 +100,10 @@ class CostRegulariser(nn.Module):
 
     def __init__(self, in_channels: int, candidates: int, config: UNetConfig) -> None:
         super().__init__()
-        self.shuffle = config.shuffle
-        block = self.shuffle**2
-        self.conv_in = nn.Conv2d(in_channels * block, config.channels, 3, padding=1)
+        self.conv_in = nn.Conv2d(in_channels, config.channels, 3, padding=1)
         self.norm_in = nn.GroupNorm(GROUPS, config.channels)
         self.unet = UNet(config)
-        self.conv_out = nn.Conv2d(config.channels, candidates * block, 3, padding=1)
+        self.conv_out = nn.Conv2d(config.channels, candidates, 3, padding=1)
 
     def forward(self, x: Tensor, views: int) -> Tensor:
         """[groups * views, in_channels, h, w] -> probabilities [groups * views, candidates, h, w]."""
@@ -113,7 +111,5 @@ class CostRegulariser(nn.Module):
 
     def scores(self, x: Tensor, views: int) -> Tensor:
         """The same before the softmax."""
-        if self.shuffle > 1:
-            x = F.pixel_unshuffle(x, self.shuffle)
-        scores = self.conv_out(self.unet(F.gelu(self.norm_in(self.conv_in(x))), views))
-        return F.pixel_shuffle(scores, self.shuffle) if self.shuffle > 1 else scores
+        scores: Tensor = self.conv_out(self.unet(F.gelu(self.norm_in(self.conv_in(x))), views))
+        return scores

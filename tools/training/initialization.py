@@ -89,12 +89,9 @@ def _set_identity_projections(layer: EpipolarAttention) -> None:
 def _set_smoothing(regulariser: CostRegulariser, first: int) -> None:
     """Pass the candidates, input channels from `first` on, through the U-Net to the logits, smoothed."""
     unet = regulariser.unet
-    # With pixel unshuffling, each pixel of a block has its own group of channels.
-    block = regulariser.shuffle**2
-    channels, candidates = unet.conv_in.weight.shape[0], regulariser.conv_out.weight.shape[0] // block
-    triangles = _triangles(channels // block, candidates)
-    pixels = torch.eye(block)
-    _set_centre(regulariser.conv_in, torch.kron(triangles / triangles.sum(1, keepdim=True), pixels), first * block)
+    channels, candidates = unet.conv_in.weight.shape[0], regulariser.conv_out.weight.shape[0]
+    triangles = _triangles(channels, candidates)
+    _set_centre(regulariser.conv_in, triangles / triangles.sum(1, keepdim=True), first)
     _set_centre(unet.conv_in, torch.eye(channels), 0)
     # The last block's shortcut reads the upsampled map, then the skip connection, which is passed on.
     last_block = unet.up_blocks[-1]
@@ -102,9 +99,7 @@ def _set_smoothing(regulariser: CostRegulariser, first: int) -> None:
     _set_centre(last_block.shortcut, torch.eye(channels), channels)
     nn.init.zeros_(last_block.conv2.weight)
     _set_centre(unet.conv_out, torch.eye(channels), 0)
-    _set_centre(
-        regulariser.conv_out, torch.kron((TEMPERATURE * triangles / triangles.sum(0)).T.contiguous(), pixels), 0
-    )
+    _set_centre(regulariser.conv_out, (TEMPERATURE * triangles / triangles.sum(0)).T, 0)
 
 
 def _triangles(channels: int, candidates: int) -> Tensor:
