@@ -1,15 +1,16 @@
-"""Prediction for any number of views, in groups that fit the memory."""
+"""Prediction for any number of views, in groups as large as the network was trained with, and as fit the memory."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from ..errors import InputError
 from ..inference.predictor import Prediction, Predictor
 from ..splats.gaussians import Gaussians
 from ..system.progress import progress
 from ..views.batch import ViewBatch
-from ..views.depth_range import DepthRange
+from ..views.depth_range import BASELINE, DepthRange
 from ..views.groups import group_views, nearest_views
 
 # Pixels of all views that the network gets together: about 2 GB of memory with the bundled model.
@@ -20,17 +21,25 @@ MIN_GROUP = 3  # views
 VOTERS = 24
 
 
-def predict_views(predictor: Predictor, views: ViewBatch, span: DepthRange) -> Prediction:
-    """Depth and Gaussians of all views, each predicted once, beside the views that suit it best."""
+def predict_views(
+    predictor: Predictor, views: ViewBatch, span: DepthRange, near: float | None = None, far: float | None = None
+) -> Prediction:
+    """Depth and Gaussians of all views, each predicted once, beside the views that suit it best.
+
+    span: the depth range of all views. near, far: where they are given; else each group has its own depth range, which
+    is narrower, so that more depth candidates lie where its surfaces are.
+    """
     height, width = views.images.shape[2:]
-    size = max(MIN_GROUP, GROUP_PIXELS // (height * width))
+    size = max(MIN_GROUP, min(max(predictor.metadata.trained_views), GROUP_PIXELS // (height * width)))
     groups = group_views(views.cameras, _middle_depths(views, span), size)
     if len(groups) == 1:
         return predictor.predict_views(views, span.near, span.far)
     parts: dict[int, Prediction] = {}
     seconds: dict[str, float] = {}
     for group in progress(groups, "predicting groups of views"):
-        prediction = predictor.predict_views(_subset(views, group.views), span.near, span.far)
+        members = _subset(views, group.views)
+        own = _own_range(predictor, members, span, near, far)
+        prediction = predictor.predict_views(members, own.near, own.far)
         for name, value in prediction.seconds.items():
             seconds[name] = seconds.get(name, 0) + value
         parts |= {view: _of_view(prediction, group.views.index(view)) for view in group.used}
@@ -42,6 +51,17 @@ def predict_views(predictor: Predictor, views: ViewBatch, span: DepthRange) -> P
         seconds,
         [part.cameras[0] for part in ordered],
     )
+
+
+def _own_range(
+    predictor: Predictor, members: ViewBatch, span: DepthRange, near: float | None, far: float | None
+) -> DepthRange:
+    """The depth range of a group; that of all views where the group's images do not tell it."""
+    try:
+        found = predictor.depth_range(members, near, far)
+    except InputError:  # a near that is given lies behind all that the group sees
+        return span
+    return span if found.source.endswith(BASELINE) else found
 
 
 def voting_views(views: ViewBatch, span: DepthRange) -> list[np.ndarray]:

@@ -18,6 +18,7 @@ from .selection import PairScorer, guess_scene_depths
 
 LOG = logging.getLogger(__name__)
 
+BASELINE = "the baseline"  # the source that knows nothing of the scene
 SAMPLED_IMAGES = 3  # that are matched, with two others each, for the depth of the scene
 MIN_PARALLAX_DEG = 0.3  # with less, a triangulated depth is mostly noise
 
@@ -112,7 +113,7 @@ def _triangulate(matches: PointMatches) -> tuple[np.ndarray, np.ndarray]:
 def _from_baseline(extrinsics: np.ndarray, trained: tuple[float, float]) -> DepthRange:
     positions = extrinsics[:, :3, 3]
     baseline = max(float(np.linalg.norm(positions[i] - positions[j])) for i, j in nearest_neighbor_pairs(extrinsics))
-    return DepthRange(baseline, baseline * trained[1] / trained[0], "the baseline")
+    return DepthRange(baseline, baseline * trained[1] / trained[0], BASELINE)
 
 
 def scene_depths(cameras: Sequence[Camera], feature_image: Callable[[int], FeatureImage]) -> tuple[np.ndarray, str]:

@@ -1,13 +1,16 @@
 """Prediction in groups: every view once, in order, from a group that fits the memory."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from idesplat.runtime.cameras.camera import Camera
+from idesplat.runtime.errors import InputError
 from idesplat.runtime.inference.predictor import Prediction
 from idesplat.runtime.reconstruction import many_views
 from idesplat.runtime.splats.gaussians import Gaussians
 from idesplat.runtime.views.batch import ViewBatch
-from idesplat.runtime.views.depth_range import DepthRange
+from idesplat.runtime.views.depth_range import BASELINE, DepthRange
 
 HEIGHT, WIDTH = 4, 6
 SPAN = DepthRange(5.0, 20.0, "given")
@@ -27,14 +30,24 @@ def batch(count: int) -> ViewBatch:
 
 
 class NumberingPredictor:
-    """Predicts each image's number as its depth, opacity and means; keeps the sizes of the groups."""
+    """Predicts each image's number as its depth, opacity and means; keeps the groups and their depth ranges."""
 
-    def __init__(self, gaussians: bool) -> None:
-        self.gaussians, self.groups = gaussians, []
+    def __init__(self, gaussians: bool, trained_views: int = 5, source: str = "points") -> None:
+        self.gaussians, self.source = gaussians, source
+        self.groups: list[list[str]] = []
+        self.ranges: list[tuple[float, float]] = []
+        self.metadata = SimpleNamespace(trained_views=[2, trained_views])
+
+    def depth_range(self, views: ViewBatch, near: float | None, far: float | None) -> DepthRange:
+        """A range that the first image's number tells; none for a near beyond it, as the real one."""
+        found = DepthRange(near or 1.0 + views.images[0, 0, 0, 0], far or 30.0, self.source)
+        if found.near >= found.far:
+            raise InputError("near")
+        return found
 
     def predict_views(self, views: ViewBatch, near: float, far: float) -> Prediction:
-        assert (near, far) == (SPAN.near, SPAN.far)
         self.groups.append(views.names)
+        self.ranges.append((near, far))
         depth = views.images[:, 0]
         flat = depth.ravel()
         gaussians = Gaussians(
@@ -71,3 +84,25 @@ def test_large_images_still_run_in_groups_of_three(monkeypatch: pytest.MonkeyPat
     predictor = NumberingPredictor(True)
     many_views.predict_views(predictor, batch(7), SPAN)
     assert {len(names) for names in predictor.groups} <= {2, 3}
+
+
+def test_a_group_is_no_larger_than_the_network_was_trained_with() -> None:
+    predictor = NumberingPredictor(True, trained_views=3)
+    many_views.predict_views(predictor, batch(7), SPAN)
+    assert {len(names) for names in predictor.groups} <= {2, 3}
+    whole = NumberingPredictor(True, trained_views=8)
+    many_views.predict_views(whole, batch(7), SPAN)
+    assert [len(names) for names in whole.groups] == [7] and whole.ranges == [(SPAN.near, SPAN.far)]
+
+
+def test_every_group_has_its_own_depth_range_unless_it_is_given_or_unknown() -> None:
+    own, given, unknown, behind = (
+        NumberingPredictor(True, 3, source) for source in ("points", "given", BASELINE, "points")
+    )
+    many_views.predict_views(own, batch(7), SPAN)
+    assert own.ranges == [(1.0 + int(names[0].partition(".")[0]), 30.0) for names in own.groups]
+    many_views.predict_views(given, batch(7), SPAN, near=2.0, far=9.0)
+    assert set(given.ranges) == {(2.0, 9.0)}
+    many_views.predict_views(unknown, batch(7), SPAN)
+    many_views.predict_views(behind, batch(7), SPAN, near=40.0)
+    assert set(unknown.ranges) == set(behind.ranges) == {(SPAN.near, SPAN.far)}
