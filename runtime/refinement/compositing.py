@@ -66,7 +66,7 @@ def fill_keys(boxes: np.ndarray, depth_bits: np.ndarray, starts: np.ndarray, key
 
 
 @compiled_finite
-def _exp_of_falloff(x: float) -> float:
+def _exp_of_falloff(x: np.floating) -> np.floating:
     """exp(x) for x from LOG_MIN_ALPHA to 0, to 4e-6 of it: the series of exp(x / 16) to the power of 16."""
     y = x * np.float32(1 / 16)
     series = np.float32(1 / 24) + y * (np.float32(1 / 120) + y * np.float32(1 / 720))
