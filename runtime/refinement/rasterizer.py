@@ -88,7 +88,9 @@ def compile_all() -> None:
         rasterizer = GradientRasterizer(parameters)
         done = rasterizer.forward(Target(np.eye(4), np.eye(3), 1, 1))
         moments, lr = np.zeros((1, 2, parameters.columns), np.float32), np.zeros(parameters.columns)
-        rasterizer.step(done, rasterizer.backward(done, np.zeros_like(done.rgb)), moments, lr, 1)
+        gradients = rasterizer.backward(done, np.zeros_like(done.rgb))
+        rasterizer.weights(done, gradients)
+        rasterizer.step(done, gradients, moments, lr, 1)
 
 
 @dataclass(eq=False)
