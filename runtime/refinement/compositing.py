@@ -217,12 +217,18 @@ def composite_backward(
 
 
 @compiled_fast
+def end_of_entries(index: int, boxes: np.ndarray, offsets: np.ndarray) -> int:
+    """The entry after the last one of a Gaussian that is seen."""
+    end: int = offsets[index] + (boxes[index, 3] - 1) // BAND_ROWS - boxes[index, 2] // BAND_ROWS + 1
+    return end
+
+
+@compiled_fast
 def add_weights(
     boxes: np.ndarray, offsets: np.ndarray, gradients: np.ndarray, start: int, stop: int, total: np.ndarray
 ) -> None:
     """Add the weights in the image of the Gaussians from `start` to `stop` to `total`, [gaussians] float64."""
     for index in range(start, stop):
         if boxes[index, 3] > boxes[index, 2]:
-            end = offsets[index] + (boxes[index, 3] - 1) // BAND_ROWS - boxes[index, 2] // BAND_ROWS + 1
-            for entry in range(offsets[index], end):
+            for entry in range(offsets[index], end_of_entries(index, boxes, offsets)):
                 total[index] += gradients[entry, WEIGHT]

@@ -10,7 +10,6 @@ from ..geometry.sh import SH_1, SH_2, SH_3
 from ..rendering.rasterizer_numba import fill_rotation, fill_sh_basis
 from ..rendering.types import MIN_ALPHA
 from .compositing import (
-    BAND_ROWS,
     CONIC_XX,
     CONIC_XY,
     CONIC_YY,
@@ -23,6 +22,7 @@ from .compositing import (
     X,
     Y,
     compiled_fast,
+    end_of_entries,
 )
 
 EPSILON = 1e-15  # of Adam, as 3DGS has it
@@ -246,8 +246,7 @@ def _gaussian_gradient(
 @compiled_fast
 def _sum_entries(index: int, boxes: np.ndarray, offsets: np.ndarray, gradients: np.ndarray, total: np.ndarray) -> None:
     total[:] = 0.0
-    first, end = offsets[index], offsets[index] + (boxes[index, 3] - 1) // BAND_ROWS - boxes[index, 2] // BAND_ROWS + 1
-    for entry in range(first, end):
+    for entry in range(offsets[index], end_of_entries(index, boxes, offsets)):
         for column in range(ENTRY):
             total[column] += gradients[entry, column]
 
