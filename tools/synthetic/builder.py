@@ -4,11 +4,12 @@ y points down and the floor is at y = 0, so that heights are negative. Lengths a
 """
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
-from .raycast import BOX
-from .scene import Scene
+from .raycast import BOX, HEIGHT_FIELD
+from .scene import WAVES, Scene
 from .textures import PHOTO_KIND, Textures
 
 # Kinds of textures (`textures.PATTERNS`) for surfaces; a kind that is repeated is more probable.
@@ -22,8 +23,24 @@ ANY_KINDS = (
     *("glyphs", "gradient", "cells", "weave", "strokes", "collage"),
 )
 
+NO_CUT = (0.0, 0.0, 0.0, 0.0)
+# Periods of a height field's waves along its sides of length 2, and how much lower each wave is than the one before.
+WAVE_PERIODS, WAVE_DECAY = (0.3, 1.5), 0.6
+
 # Probability that a material has a texture cropped from an image, if there are any.
 PHOTO_PROBABILITY = 0.5
+
+
+class Solid(NamedTuple):
+    """A solid in world coordinates; the fields are those of `Scene` for one solid."""
+
+    shape: int
+    centre: np.ndarray
+    axes: np.ndarray
+    halves: np.ndarray
+    cut: tuple[float, float, float, float]
+    waves: np.ndarray
+    materials: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -43,7 +60,7 @@ class SceneBuilder:
     textures: Textures
     yaw: float = 0.0
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    solids: list[tuple[int, np.ndarray, np.ndarray, np.ndarray, tuple[int, ...]]] = field(default_factory=list)
+    solids: list[Solid] = field(default_factory=list)
     materials: list[tuple[int, np.ndarray, np.ndarray, float, float]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -79,16 +96,20 @@ class SceneBuilder:
         half: tuple[float, float, float],
         materials: int | tuple[int, ...],
         axes: np.ndarray | None = None,
+        cut: tuple[float, float, float, float] = NO_CUT,
     ) -> None:
         """Add a solid at `centre` with half extents `half`, both in the builder's frame.
 
-        materials: one, or those of the six faces as in `Scene.materials`. axes: rows, the solid's axes.
+        materials: one, or those of the six faces as in `Scene.materials`. axes: rows, the solid's axes. cut: the ball
+        that is cut out, as in `Scene.cuts`. Height fields have random waves.
         """
         cos, sin = np.cos(self.yaw), np.sin(self.yaw)
         frame = np.array([[cos, 0.0, -sin], [0.0, 1.0, 0.0], [sin, 0.0, cos]])  # rows: the frame's axes
         rotated = frame if axes is None else axes @ frame
         faces = (materials,) * 6 if isinstance(materials, int) else materials
-        self.solids.append((shape, np.array(centre) @ frame + self.position, rotated, np.array(half, float), faces))
+        waves = _random_waves(self.rng) if shape == HEIGHT_FIELD else np.zeros((WAVES, 4))
+        place = np.array(centre) @ frame + self.position
+        self.solids.append(Solid(shape, place, rotated, np.array(half, float), cut, waves, faces))
 
     def box(self, x: float, y: float, z: float, half_x: float, half_y: float, half_z: float, material: int) -> None:
         """Add a box at (x, y, z) whose axes are those of the builder's frame."""
@@ -96,7 +117,7 @@ class SceneBuilder:
 
     def scene(self, lights: list[tuple[np.ndarray, np.ndarray, float, float]], ambient: np.ndarray) -> Scene:
         """The scene with all solids that were added. lights: (position, colour, reach, half length), as in `Scene`."""
-        shapes, centres, axes, halves, faces = zip(*self.solids, strict=True)
+        shapes, centres, axes, halves, cuts, waves, faces = zip(*self.solids, strict=True)
         textures, uv, colours, speculars, emissions = zip(*self.materials, strict=True)
         positions, light_colours, reaches, lengths = zip(*lights, strict=True)
         return Scene(
@@ -104,6 +125,8 @@ class SceneBuilder:
             np.array(centres),
             np.array(axes),
             np.array(halves),
+            np.array(cuts),
+            np.array(waves),
             np.array(faces),
             np.array(textures),
             np.array(uv),
@@ -164,6 +187,17 @@ def lamplit_scene(builder: SceneBuilder, width: float, height: float, length: fl
             (position, rng.uniform(0.5, 0.95) / count**0.5 * _light_colour(rng), rng.uniform(2.5, 6.0), half_length)
         )
     return builder.scene(lights, rng.uniform(0.35, 0.6) * _light_colour(rng))
+
+
+def _random_waves(rng: np.random.Generator) -> np.ndarray:
+    """Waves of a height field, as in `Scene.waves`: each finer and lower than the one before; heights within .9."""
+    frequencies = np.sort(rng.uniform(*WAVE_PERIODS, WAVES))
+    bearing = rng.uniform(0, 2 * np.pi, WAVES)
+    heights = WAVE_DECAY ** np.arange(WAVES)
+    columns = frequencies * np.cos(bearing), frequencies * np.sin(bearing), rng.random(WAVES), heights
+    waves = np.stack(columns, axis=1)
+    waves[:, 3] *= 0.9 / heights.sum()
+    return waves
 
 
 def _light_colour(rng: np.random.Generator) -> np.ndarray:

@@ -3,8 +3,18 @@
 import numpy as np
 
 from .builder import ANY_KINDS, FLOOR_KINDS, Layout, SceneBuilder, add_room, lamplit_scene, random_rotation
-from .objects import add_chair, add_crates, add_lamp, add_plant, add_small_object, add_table, furnish_wall
-from .raycast import BOX, CYLINDER, ELLIPSOID
+from .objects import (
+    add_bowl,
+    add_chair,
+    add_crates,
+    add_cup,
+    add_lamp,
+    add_plant,
+    add_small_object,
+    add_table,
+    furnish_wall,
+)
+from .raycast import BOX, CYLINDER, ELLIPSOID, HEIGHT_FIELD
 from .textures import Textures
 
 
@@ -91,4 +101,46 @@ def cards(rng: np.random.Generator, textures: Textures) -> Layout:
         builder.add(BOX, centre, half, builder.material(*ANY_KINDS, period=2 * size * rng.uniform(0.5, 2)), tilt)
     eye_bounds = np.array([[-0.3 * width, -0.8 * height, -0.48 * length], [0.3 * width, -0.2 * height, -0.35 * length]])
     focus_bounds = np.array([[-0.1 * width, -0.7 * height, 0.2 * length], [0.1 * width, -0.3 * height, 0.3 * length]])
+    return Layout(lamplit_scene(builder, width, height, length), eye_bounds, focus_bounds)
+
+
+def covered_table(rng: np.random.Generator, textures: Textures) -> Layout:
+    """A table under a creased cloth, with bowls, cups, fruit and boxes on it, seen from nearby."""
+    builder = SceneBuilder(rng, textures)
+    width, height, length = add_room(builder)
+    top, crease = 0.75, rng.uniform(0.005, 0.04)
+    cloth = builder.material("weave", "stripes", "checker", "plain", "collage", period=rng.uniform(0.2, 1.0))
+    builder.add(HEIGHT_FIELD, (0, -top, 0), (rng.uniform(0.5, 1.0), crease, rng.uniform(0.4, 0.8)), cloth)
+    builder.box(0, -top / 2, 0, 0.4, top / 2 - crease, 0.3, builder.material("wood", "plain"))
+    for _ in range(rng.integers(4, 12)):
+        builder.position = (rng.uniform(-0.45, 0.45), -top, rng.uniform(-0.35, 0.35))
+        builder.yaw = rng.uniform(0, 2 * np.pi)
+        (add_bowl, add_cup, add_small_object)[rng.integers(3)](builder, rng.uniform(0.04, 0.14))
+    builder.position, builder.yaw = (0.0, 0.0, 0.0), 0.0
+    eye_bounds = np.array([[-1.0, -top - 0.8, -1.0], [1.0, -top - 0.15, 1.0]])
+    focus_bounds = np.array([[-0.2, -top - 0.1, -0.2], [0.2, -top, 0.2]])
+    return Layout(lamplit_scene(builder, width, height, length), eye_bounds, focus_bounds)
+
+
+def bars(rng: np.random.Generator, textures: Textures) -> Layout:
+    """A railing, a grid or wires before a wall and objects: structures of few pixels before a far background."""
+    builder = SceneBuilder(rng, textures)
+    width, height, length = add_room(builder, rng.uniform(1.0, 1.5))
+    builder.yaw = rng.uniform(-0.6, 0.6)
+    shape, thickness = int(rng.choice([BOX, CYLINDER])), rng.uniform(0.006, 0.04)
+    metal = builder.material("plain", "plain", "wood", "noise", period=0.3)
+    gap, reach = rng.uniform(0.12, 0.4), 0.45 * width
+    for x in np.arange(-reach, reach, gap):
+        builder.add(shape, (x, -height / 2, 0), (thickness, height / 2, thickness), metal)
+    upright = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]])  # the solid's y along x
+    heights = np.arange(0.2, height, gap) if rng.random() < 0.5 else rng.uniform(0.2, 0.9, 2) * height
+    for y in heights:
+        builder.add(shape, (0, -y, 0), (thickness, reach, thickness), metal, upright)
+    for _ in range(rng.integers(3, 9)):
+        side = rng.uniform(0.5, 2.0) if rng.random() < 0.8 else -0.5
+        builder.position, builder.yaw = (rng.uniform(-0.35, 0.35) * width, 0.0, side), rng.uniform(0, 2 * np.pi)
+        (add_chair, add_plant, add_crates, add_lamp)[rng.integers(4)](builder)
+    builder.position, builder.yaw = (0.0, 0.0, 0.0), 0.0
+    eye_bounds = np.array([[-0.3 * width, -0.8 * height, -0.48 * length], [0.3 * width, -0.3 * height, -0.25 * length]])
+    focus_bounds = np.array([[-0.2 * width, -0.6 * height, 0.0], [0.2 * width, -0.3 * height, 0.2 * length]])
     return Layout(lamplit_scene(builder, width, height, length), eye_bounds, focus_bounds)

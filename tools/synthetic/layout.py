@@ -5,8 +5,8 @@ from collections.abc import Callable
 import numpy as np
 
 from .builder import Layout
-from .indoor import cards, clutter, furnished_room, table_top
-from .outdoor import around_object, facade, foliage, from_above, street
+from .indoor import bars, cards, clutter, covered_table, furnished_room, table_top
+from .outdoor import around_object, facade, foliage, from_above, hills, street
 from .textures import Textures
 
 # Kinds of scenes; one that is repeated is more probable. The second tuple is used in training alone.
@@ -14,10 +14,10 @@ LAYOUTS: tuple[Callable[[np.random.Generator, Textures], Layout], ...] = (
     *(furnished_room, furnished_room, furnished_room),
     *(clutter, clutter, street, table_top, cards),
 )
-OUTDOOR_LAYOUTS = (facade, around_object, around_object, from_above, foliage)
+TRAINING_LAYOUTS = (facade, around_object, around_object, from_above, foliage, hills, covered_table, bars)
 
 
-def generate_layout(rng: np.random.Generator, textures: Textures, outdoors: bool = False) -> Layout:
-    """A scene of a random kind. outdoors: whether `OUTDOOR_LAYOUTS` are among the kinds."""
-    layouts = LAYOUTS + OUTDOOR_LAYOUTS if outdoors else LAYOUTS
+def generate_layout(rng: np.random.Generator, textures: Textures, training: bool = False) -> Layout:
+    """A scene of a random kind. training: whether `TRAINING_LAYOUTS` are among the kinds."""
+    layouts = LAYOUTS + TRAINING_LAYOUTS if training else LAYOUTS
     return layouts[rng.integers(len(layouts))](rng, textures)

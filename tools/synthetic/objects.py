@@ -75,6 +75,28 @@ def add_small_object(builder: SceneBuilder, size: float) -> None:
         builder.box(0, y - size, 0, 0.8 * size, size, 0.03 * size, material)
 
 
+def add_bowl(builder: SceneBuilder, size: float) -> None:
+    """Add a bowl, a half ball that is hollow, often with a fruit in it. size: its radius in metres."""
+    rng = builder.rng
+    material, height = builder.material(*ANY_KINDS, period=size * rng.uniform(0.7, 3.0)), size * rng.uniform(0.4, 0.9)
+    # In the unit frame, y = 1 is the foot: a ball about the middle of the open side leaves a wall and a floor.
+    builder.add(CYLINDER, (0, -height, 0), (size, height, size), material, cut=(0.0, -1.0, 0.0, rng.uniform(0.9, 0.97)))
+    if rng.random() < 0.6:
+        fruit = builder.material("plain", "noise", "speckle", "gradient", period=size)
+        builder.add(ELLIPSOID, (0, -1.2 * height, 0), tuple(0.5 * size * np.exp(rng.normal(0, 0.2, 3))), fruit)
+
+
+def add_cup(builder: SceneBuilder, size: float) -> None:
+    """Add a cup, or a box that is hollow. size: about its height in metres."""
+    rng = builder.rng
+    material, width = builder.material(*ANY_KINDS, period=size * rng.uniform(0.7, 3.0)), size * rng.uniform(0.3, 0.6)
+    shape = int(rng.choice([CYLINDER, CYLINDER, BOX]))
+    cut = (0.0, -1.0, 0.0, rng.uniform(0.85, 0.95))
+    builder.add(shape, (0, -size / 2, 0), (width, size / 2, width), material, cut=cut)
+    if rng.random() < 0.5:  # a handle, or a pen
+        builder.add(BOX, (width, -size / 2, 0), (0.3 * width, 0.3 * size, 0.08 * width), material)
+
+
 def add_chair(builder: SceneBuilder) -> None:
     """Add a chair with a back."""
     material = builder.material(*FURNITURE_KINDS)

@@ -16,7 +16,7 @@ from .builder import (
     sunlit_scene,
 )
 from .objects import add_chair, add_crates, add_fence, add_plant, add_sign, add_tree
-from .raycast import BOX, CYLINDER, ELLIPSOID
+from .raycast import BOX, CYLINDER, ELLIPSOID, HEIGHT_FIELD
 from .textures import Textures
 
 
@@ -153,3 +153,24 @@ def foliage(rng: np.random.Generator, textures: Textures) -> Layout:
     builder.position = (0.0, 0.0, 0.0)
     eye_bounds = np.array([[-1.5, -1.7, -3.5], [1.5, -0.5, -1.8]])
     return Layout(sunlit_scene(builder), eye_bounds, np.array([[-0.8, -0.9, 0.0], [0.8, -0.3, 1.0]]))
+
+
+def hills(rng: np.random.Generator, textures: Textures) -> Layout:
+    """Uneven ground with rocks, trees and fences, under the sky."""
+    builder = SceneBuilder(rng, textures)
+    add_open_ground(builder, *GROUND_KINDS)
+    rise = np.exp(rng.uniform(np.log(0.1), np.log(1.5)))
+    ground = builder.material("strokes", "noise", "cells", "speckle", period=rng.uniform(0.8, 4.0))
+    builder.add(HEIGHT_FIELD, (0, -rise, 0), (9.0, rise, 9.0), ground)
+    rock = builder.material("noise", "speckle", "cells", period=rng.uniform(0.3, 1.5))
+    for _ in range(rng.integers(3, 14)):
+        size = rng.uniform(0.1, 0.7)
+        centre = (rng.uniform(-4, 4), -1.2 * rise, rng.uniform(-4, 4))
+        builder.add(ELLIPSOID, centre, tuple(size * np.exp(rng.normal(0, 0.4, 3))), rock, random_rotation(rng))
+    for _ in range(rng.integers(1, 7)):
+        builder.position = (rng.uniform(-5, 5), -rise, rng.uniform(-3, 6))
+        builder.yaw = rng.uniform(0, 2 * np.pi)
+        (add_tree, add_fence, add_sign, add_crates, add_plant)[rng.integers(5)](builder)
+    builder.position, builder.yaw = (0.0, 0.0, 0.0), 0.0
+    eye_bounds = np.array([[-4, -2 * rise - 2.5, -7], [4, -2 * rise - 0.6, -3]])
+    return Layout(sunlit_scene(builder), eye_bounds, np.array([[-2, -rise - 1.0, -1], [2, -rise, 3]]))

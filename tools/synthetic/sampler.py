@@ -30,16 +30,18 @@ MAX_ATTEMPTS, MIN_OVERLAP = 60, 0.6
 
 @dataclass(frozen=True)
 class CameraVariation:
-    """How the views of a capture differ: relative ranges of exposure and channel gains; share of JPEG images."""
+    """How the views of a capture differ: relative ranges of exposure and channel gains; shares of JPEG and of moved."""
 
     exposure: float
     white_balance: float
     jpeg: float
+    moved: float
 
 
 # For training scenes, and for validation and held-out scenes.
-TRAINING_VARIATION, HELD_OUT_VARIATION = CameraVariation(0.08, 0.03, 0.5), CameraVariation(0.05, 0.0, 0.0)
+TRAINING_VARIATION, HELD_OUT_VARIATION = CameraVariation(0.08, 0.03, 0.5, 0.1), CameraVariation(0.05, 0.0, 0.0, 0.0)
 JPEG_QUALITY = (60, 98)
+MOTION = (1.0, 3.5)  # length of motion blur in pixels
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,7 @@ def generate_sample(
     rng = np.random.default_rng(seed)
     training = seed in TRAINING_SEEDS
     textures = textures or scene_textures(seed)
-    layout = generate_layout(rng, textures, outdoors=training)
+    layout = generate_layout(rng, textures, training=training)
     intrinsics = _sample_intrinsics(rng, context + targets, width / height)
     extrinsics = _sample_poses(rng, layout, intrinsics, context, targets)
     for view, zoom in enumerate(target_zooms, start=context):
@@ -260,7 +262,7 @@ def _sample_depth_range(rng: np.random.Generator, depth: np.ndarray) -> tuple[fl
 def _simulate_camera(
     rng: np.random.Generator, image: np.ndarray, degrade: bool, variation: CameraVariation
 ) -> np.ndarray:
-    """The clipped image [height, width, 3]; `degrade` adds random exposure, white balance, blur, noise and JPEG."""
+    """The clipped image [height, width, 3]; `degrade` adds random exposure, white balance, blur, noise, JPEG."""
     if degrade:
         image = image * np.float32(rng.uniform(1 - variation.exposure, 1 + variation.exposure))
         if variation.white_balance:
@@ -268,6 +270,8 @@ def _simulate_camera(
         blur = rng.uniform(-0.5, 0.8)  # pixels
         if blur > 0.25:
             image = cv2.GaussianBlur(image, (5, 5), blur)
+        if variation.moved and rng.random() < variation.moved:
+            image = cv2.filter2D(image, -1, _motion_kernel(rng.uniform(*MOTION), rng.uniform(0, np.pi)))
         image = image + np.float32(max(rng.uniform(-0.01, 0.02), 0)) * rng.standard_normal(image.shape, np.float32)
     image = image.clip(0, 1).astype(np.float32)
     if degrade and variation.jpeg and rng.random() < variation.jpeg:
@@ -275,3 +279,15 @@ def _simulate_camera(
         _, coded = cv2.imencode(".jpg", np.rint(255 * image).astype(np.uint8), (cv2.IMWRITE_JPEG_QUALITY, quality))
         image = np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR), np.float32) / 255
     return image
+
+
+def _motion_kernel(length: float, angle: float) -> np.ndarray:
+    """The blur of an image that moves by `length` pixels along a line, an odd square that sums to 1."""
+    reach = int(np.ceil(length / 2)) + 1
+    kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
+    for place in np.linspace(-length / 2, length / 2, 8 * reach):
+        x, y = reach + place * np.cos(angle), reach + place * np.sin(angle)
+        column, row = int(x), int(y)
+        weights = np.outer((1 - y + row, y - row), (1 - x + column, x - column))  # bilinear
+        kernel[row : row + 2, column : column + 2] += weights
+    return (kernel / kernel.sum()).astype(np.float32)

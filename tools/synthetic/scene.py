@@ -4,6 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+WAVES = 4  # of a height field
+
 
 class Scene(NamedTuple):
     """Solids, materials and lights, in metres; y points down. Solid 0 encloses all others and the cameras.
@@ -12,10 +14,12 @@ class Scene(NamedTuple):
     the texture; its colour is `colour @ (r, g, b, 1)` for a texel (r, g, b).
     """
 
-    shapes: np.ndarray  # [solids] int64: BOX, ELLIPSOID or CYLINDER
+    shapes: np.ndarray  # [solids] int64: BOX, ELLIPSOID, CYLINDER or HEIGHT_FIELD
     centres: np.ndarray  # [solids, 3]
     axes: np.ndarray  # [solids, 3, 3], rows: the local axes in the world
     halves: np.ndarray  # [solids, 3], half extents along the local axes
+    cuts: np.ndarray  # [solids, 4], centre and radius of a ball that is cut out, in the unit frame; radius 0: none
+    waves: np.ndarray  # [solids, WAVES, 4], of height fields (`_height` in raycast.py)
     materials: np.ndarray  # [solids, 6] int64, of the faces -x, +x, -y, +y, -z, +z
     textures: np.ndarray  # [materials] int64, index of a texture
     uv: np.ndarray  # [materials, 2, 3]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from idesplat.runtime.errors import InputError
 from idesplat.tools.synthetic.builder import SceneBuilder
-from idesplat.tools.synthetic.layout import LAYOUTS, OUTDOOR_LAYOUTS
+from idesplat.tools.synthetic.layout import LAYOUTS, TRAINING_LAYOUTS
 from idesplat.tools.synthetic.photo_textures import photo_textures
 from idesplat.tools.synthetic.sampler import TRAINING_SEEDS, VALIDATION_SEEDS
 from idesplat.tools.synthetic.textures import PHOTO_KIND, SIZE, texture_bank
@@ -58,13 +58,13 @@ def test_training_scenes_change_and_reported_ones_do_not(folder: Path) -> None:
     assert (generate_views(reported).images == generate_views(reported, folder).images).all()
 
 
-@pytest.mark.parametrize("kind", range(len(OUTDOOR_LAYOUTS)))
+@pytest.mark.parametrize("kind", range(len(TRAINING_LAYOUTS)))
 def test_training_scene_kinds_are_well_formed(kind: int) -> None:
-    layout = OUTDOOR_LAYOUTS[kind](np.random.default_rng(kind), texture_bank(1, 13))
+    layout = TRAINING_LAYOUTS[kind](np.random.default_rng(kind), texture_bank(1, 13))
     assert (layout.eye_bounds[0] <= layout.eye_bounds[1]).all() and (
         layout.focus_bounds[0] <= layout.focus_bounds[1]
     ).all()
     assert (layout.eye_bounds[:, 1] < 0).all()  # above the ground; y points down
     assert len(layout.scene.shapes) == len(layout.scene.materials) > 3
     assert layout.scene.materials.max() < len(layout.scene.textures)
-    assert OUTDOOR_LAYOUTS[kind] not in LAYOUTS
+    assert TRAINING_LAYOUTS[kind] not in LAYOUTS

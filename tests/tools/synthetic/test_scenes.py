@@ -5,18 +5,19 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from idesplat.tools.synthetic.indoor import furnished_room
-from idesplat.tools.synthetic.raycast import BOX, CYLINDER, ELLIPSOID
+from idesplat.tools.synthetic.raycast import BOX, CYLINDER, ELLIPSOID, HEIGHT_FIELD
 from idesplat.tools.synthetic.sampler import (
     HELD_OUT_SEEDS,
     TRAINING_SEEDS,
     VALIDATION_SEEDS,
     Sample,
+    _motion_kernel,
     generate_sample,
     look_at,
     render,
     scene_textures,
 )
-from idesplat.tools.synthetic.scene import Scene
+from idesplat.tools.synthetic.scene import WAVES, Scene
 from idesplat.tools.synthetic.textures import LEVELS, SIZE, Textures, texture_bank
 
 GREY = Textures(np.full((1, sum((SIZE >> level) ** 2 for level in range(LEVELS)), 3), 128, np.uint8), ("plain",))
@@ -31,6 +32,8 @@ def scene_of(*solids: tuple[int, tuple[float, ...], tuple[float, ...], np.ndarra
         centres=np.array(centres),
         axes=np.array(axes),
         halves=np.array(halves),
+        cuts=np.zeros((len(shapes), 4)),
+        waves=np.zeros((len(shapes), WAVES, 4)),
         materials=np.zeros((len(shapes), 6), np.int64),
         textures=np.zeros(1, np.int64),
         uv=np.eye(2, 3)[None],
@@ -87,6 +90,61 @@ def test_depth_of_solids_is_analytic() -> None:
     _, depth = render(card, GREY, np.eye(4), straight, 64, 64, 0)
     np.testing.assert_allclose(depth[20:44, 20:44], 3.99, rtol=1e-6)
     assert (depth == np.float32(3.99)).mean() == pytest.approx((2 / 3.99) ** 2, rel=0.05)
+
+
+def test_what_is_cut_out_of_a_solid_is_hollow() -> None:
+    """From above into a drum: a ball of radius .9 about the middle of its open side leaves a rim and a round floor."""
+    above = look_at(np.array([0.0, -4.0, 1e-6]), np.array([0.0, 0.0, 0.0]))
+    square = np.array([[1.0, 0, 0.5], [0, 1.0, 0.5], [0, 0, 1]])
+    drum = scene_of((CYLINDER, (0.0, 0.0, 0.0), (2.0, 1.0, 2.0), np.eye(3)))
+    drum = drum._replace(cuts=np.array([[0, 0, 0, 0], [0, -1, 0, 0.9]], float))
+    _, depth = render(drum, GREY, above, square, 65, 65, 0)
+    assert depth[32, 32] == pytest.approx(4 - 1 + 0.9, rel=1e-6)  # the open side is 3 away; half the drum's height is 1
+    rays = pixel_rays(square, 65, 65)
+    points = rays * depth[..., None]  # x, y across, z down from the camera
+    across = np.hypot(points[..., 0], points[..., 1])
+    top = np.abs(points[..., 2] - 3) < 1e-5
+    assert ((across[top] > 1.8) & (across[top] < 2.0)).all() and top.sum() > 50
+    hollow = across < 1.75
+    ball = (across[hollow] / 2 / 0.9) ** 2 + ((points[..., 2][hollow] - 3) / 0.9) ** 2
+    np.testing.assert_allclose(ball, 1, atol=1e-4)
+
+
+def test_light_in_a_hollow_comes_from_the_lamp() -> None:
+    """The floor of a cut faces the lamp above as a flat top does: it is as bright."""
+    above = look_at(np.array([0.0, -4.0, 1e-6]), np.array([0.0, 0.0, 0.0]))
+    square = np.array([[1.0, 0, 0.5], [0, 1.0, 0.5], [0, 0, 1]])
+    drum = scene_of((BOX, (0.0, 0.0, 0.0), (2.0, 1.0, 2.0), np.eye(3)))
+    hollow = drum._replace(cuts=np.array([[0, 0, 0, 0], [0, -1, 0, 0.9]], float))
+    flat, cut = (render(scene, GREY, above, square, 65, 65, 1)[0][32, 32] for scene in (drum, hollow))
+    np.testing.assert_allclose(cut, flat, rtol=1e-3)
+
+
+def test_depth_of_a_height_field_is_that_of_its_waves() -> None:
+    """Hits lie on y = a p(k x): parabolas between -a and a, computed here from their definition."""
+    field = scene_of((HEIGHT_FIELD, (0.0, 0.0, 0.0), (3.0, 0.5, 3.0), np.eye(3)))
+    waves = np.zeros((2, WAVES, 4))
+    waves[1, 0] = 0.5, 0.0, 0.0, 0.8
+    pose = look_at(np.array([0.5, -3.0, -4.0]), np.array([0.0, 0.0, 0.0]))
+    _, depth = render(field._replace(waves=waves), GREY, pose, WIDE_ANGLE, 96, 96, 0)
+    points = pixel_rays(WIDE_ANGLE, 96, 96) * depth[..., None] @ pose[:3, :3].T + pose[:3, 3]
+    on_field = (np.abs(points[..., [0, 2]]) < 2.999).all(axis=-1) & (np.abs(points[..., 1]) < 0.499)
+    assert on_field.mean() > 0.3
+    x, y = points[on_field][:, 0] / 3, points[on_field][:, 1] / 0.5
+    turn = 0.5 * x - np.floor(0.5 * x + 0.5)
+    expected = 0.8 * np.where(turn > 0, 16 * turn * (0.5 - turn), 16 * turn * (0.5 + turn))
+    np.testing.assert_allclose(y, expected, atol=1e-5)
+
+
+def test_motion_blur_moves_nothing_in_the_mean() -> None:
+    for length, angle in ((1.0, 0.3), (3.5, 1.2), (2.0, np.pi / 2)):
+        kernel = _motion_kernel(length, angle).astype(float)
+        y, x = np.mgrid[: len(kernel), : len(kernel)] - len(kernel) // 2
+        assert kernel.sum() == pytest.approx(1) and kernel.min() >= 0
+        assert (kernel * x).sum() == pytest.approx(0, abs=1e-6) and (kernel * y).sum() == pytest.approx(0, abs=1e-6)
+        along = x * np.cos(angle) + y * np.sin(angle)
+        # A line of this length has a variance of length^2 / 12; bilinear weights add up to .25 in each direction.
+        assert 0 < (kernel * along**2).sum() - length**2 / 12 < 0.27
 
 
 def test_solid_casts_the_analytic_shadow() -> None:
