@@ -27,7 +27,7 @@ from .step import PHOTOMETRIC_WEIGHT, psnr, render_targets, with_input_view
 HEAD_PARTS = ("conv_image", "fuse", "focus", "expand", "head1", "head2", "cross_view")
 HEAD_PREFIXES = tuple(f"gaussians.{part}." for part in HEAD_PARTS)
 # Numbers of context views, and their probabilities.
-VIEW_COUNT_PROBABILITIES = {2: 0.75, 3: 0.15, 4: 0.1}
+VIEW_COUNT_PROBABILITIES = {2: 0.75, 3: 0.12, 4: 0.08, 6: 0.05}
 # If the mean opacity is above the first value, the sigmoid is saturated and has no gradient. The mean is then reset to
 # the second value, and scales are multiplied by SCALE_GAIN, so that the more transparent Gaussians leave no gaps.
 SATURATED_OPACITY, START_OPACITY = 0.95, 0.5

@@ -11,26 +11,26 @@ from ...synthetic.sampler import TRAINING_SEEDS, Sample, generate_sample, scene_
 from ...synthetic.textures import Textures
 from .samples import SampleSpec, TrainingViews
 
-# Probability of three context views instead of two.
-THREE_VIEW_PROBABILITY = 0.06
+# Numbers of context views once there is more than one DPBU, and their probabilities.
+VIEW_COUNT_PROBABILITIES = {2: 0.85, 3: 0.08, 4: 0.05, 6: 0.02}
 # One target view has the size of the context images; another is a crop of an image up to so many times as large.
 # Gaussians that are only rendered at the context's size leave gaps where a viewer shows them larger.
 MAX_TARGET_ZOOM = 4
 
 
 def training_spec(
-    seed: int, step: int, slot: int, rendered: bool, height: int, width: int, three_views: bool, real_ratio: float = 0.0
+    seed: int, step: int, slot: int, rendered: bool, height: int, width: int, more_views: bool, real_ratio: float = 0.0
 ) -> SampleSpec:
     """The sample at place `slot` of a step's batch, which depends on the run's seed and the step alone.
 
-    rendered: whether it has target views. three_views: whether some samples have three context views.
+    rendered: whether it has target views. more_views: whether some samples have more than two context views.
     real_ratio: probability of a capture.
     """
     rng = np.random.default_rng((seed, step, slot))
-    context = 3 if three_views and rng.random() < THREE_VIEW_PROBABILITY else 2
+    context = int(rng.choice(list(VIEW_COUNT_PROBABILITIES), p=list(VIEW_COUNT_PROBABILITIES.values())))
     scene = int(rng.integers(TRAINING_SEEDS.start, TRAINING_SEEDS.stop))
     zooms = (1, int(rng.integers(2, MAX_TARGET_ZOOM + 1))) if rendered else ()
-    return SampleSpec(scene, context, zooms, height, width, real=bool(rng.random() < real_ratio))
+    return SampleSpec(scene, context if more_views else 2, zooms, height, width, real=bool(rng.random() < real_ratio))
 
 
 def generate_views(spec: SampleSpec, photos: Path | None = None) -> TrainingViews:
