@@ -11,8 +11,8 @@ from ...synthetic.sampler import TRAINING_SEEDS, Sample, generate_sample, scene_
 from ...synthetic.textures import Textures
 from .samples import SampleSpec, TrainingViews
 
-# Numbers of context views once there is more than one DPBU, and their probabilities.
-VIEW_COUNT_PROBABILITIES = {2: 0.85, 3: 0.08, 4: 0.05, 6: 0.02}
+# Numbers of context views once there is more than one DPBU, and their probabilities. Six take 7 GB in training.
+VIEW_COUNT_PROBABILITIES = {2: 0.87, 3: 0.08, 4: 0.05}
 # One target view has the size of the context images; another is a crop of an image up to so many times as large.
 # Gaussians that are only rendered at the context's size leave gaps where a viewer shows them larger.
 MAX_TARGET_ZOOM = 4
@@ -26,8 +26,9 @@ def training_spec(
     rendered: whether it has target views. more_views: whether some samples have more than two context views.
     real_ratio: probability of a capture.
     """
-    rng = np.random.default_rng((seed, step, slot))
-    context = int(rng.choice(list(VIEW_COUNT_PROBABILITIES), p=list(VIEW_COUNT_PROBABILITIES.values())))
+    # All scenes of a step have the same number of views, so that no process waits for another.
+    of_step, rng = np.random.default_rng((seed, step)), np.random.default_rng((seed, step, slot))
+    context = int(of_step.choice(list(VIEW_COUNT_PROBABILITIES), p=list(VIEW_COUNT_PROBABILITIES.values())))
     scene = int(rng.integers(TRAINING_SEEDS.start, TRAINING_SEEDS.stop))
     zooms = (1, int(rng.integers(2, MAX_TARGET_ZOOM + 1))) if rendered else ()
     return SampleSpec(scene, context if more_views else 2, zooms, height, width, real=bool(rng.random() < real_ratio))
