@@ -28,11 +28,15 @@ MIN_RANGE, MAX_RANGE = 3.0, 6.0
 
 @dataclass(frozen=True)
 class Case:
-    """Inputs, and what the network computes from them: every tensor between stages and every output, by name."""
+    """Inputs, and what the network computes from them: every tensor between stages and every output, by name.
+
+    rounded: what it computes where every entry of the cameras is the next larger float32.
+    """
 
     name: str
     views: int
     tensors: dict[str, np.ndarray]
+    rounded: dict[str, np.ndarray]
 
 
 def verification_cases(network: NamedTensors, metadata: ModelMetadata, static: StaticShape) -> Iterator[Case]:
@@ -64,8 +68,18 @@ def different_cameras(inputs: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _case(network: NamedTensors, content: str, inputs: dict[str, Tensor]) -> Case:
-    with torch.no_grad():
-        tensors = {**inputs, **network.named(*inputs.values())}
+    tensors, rounded = _computed(network, inputs), _computed(network, _next_cameras(inputs))
     views, _, height, width = inputs["images"].shape
-    name = f"{content}, {views} views {height}x{width}"
-    return Case(name, views, {name: value.numpy() for name, value in tensors.items()})
+    return Case(f"{content}, {views} views {height}x{width}", views, tensors, rounded)
+
+
+@torch.no_grad()
+def _computed(network: NamedTensors, inputs: dict[str, Tensor]) -> dict[str, np.ndarray]:
+    """Inputs and what the network computes from them."""
+    return {name: value.numpy() for name, value in {**inputs, **network.named(*inputs.values())}.items()}
+
+
+def _next_cameras(inputs: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The same inputs, with the next larger float32 for every entry of the cameras."""
+    up = torch.tensor(torch.inf)
+    return inputs | {name: torch.nextafter(inputs[name], up) for name in ("extrinsics", "intrinsics")}

@@ -8,7 +8,9 @@ a tensor's errors are bounded:
 
 The largest error is not bounded. IDESplat's warp takes the nearest pixel: where a projection falls within rounding of
 the border between two pixels, the graph may take the other one. Its focused module keeps the strongest neighbours, and
-may choose otherwise between equals. Both change single pixels by any amount.
+may choose otherwise between equals. Both change single pixels by any amount, and where a U-Net attends from pixel to
+pixel, all others a little. So a bound is at least OWN_ERRORS times what the network's own result changes by where its
+cameras are rounded up, and never more than the bound end to end.
 """
 
 from collections.abc import Iterable, Iterator
@@ -28,6 +30,8 @@ ENCODER = "encoder"  # the stage that does not warp
 FUSED, STAGED = "fused, end to end", "staged, end to end"
 # The scales of scale-free tensors are matched below this percentile, where no value is extreme.
 BULK = 90
+# The graph rounds at every step, and the cameras of a case are rounded once.
+OWN_ERRORS = 4
 QUANTILE_NAMES = ("median", "99 %", "99.9 %")
 
 
@@ -114,7 +118,17 @@ def _tensor_errors(
             if name in tolerance.scale_free and values.shape == expected.shape:
                 values = values * _relative_scale(values, expected)
             errors, largest = error_quantiles(values, expected, case.views, tolerance.min_deviation)
-        yield TensorError(case.name, stage, name, errors, bounds, largest)
+        yield TensorError(case.name, stage, name, errors, _own_bounds(name, case, bounds, tolerance), largest)
+
+
+def _own_bounds(name: str, case: Case, bounds: ErrorQuantiles, tolerance: Tolerance) -> ErrorQuantiles:
+    """The bounds of a tensor, raised where the network itself turns rounding into larger errors."""
+    rounded, expected = case.rounded[name], case.tensors[name]
+    if name in tolerance.scale_free:
+        rounded = rounded * _relative_scale(rounded, expected)
+    own, _ = error_quantiles(rounded, expected, case.views, tolerance.min_deviation)
+    limits = zip(bounds, own, tolerance.end_to_end, strict=True)
+    return ErrorQuantiles(*(max(bound, min(OWN_ERRORS * error, most)) for bound, error, most in limits))
 
 
 def error_quantiles(

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from ..errors import InputError
 
-NAME = "idesplat-tiny.onnx"
+NAME = "idesplat-lite.onnx"
 FOLDER = Path(__file__).with_name("bundled")
 # The file beside the model, in the format of `sha256sum`.
 CHECKSUM_SUFFIX = ".sha256"

@@ -8,6 +8,8 @@ import numpy as np
 from ..cameras.camera import Camera
 from .selection import score_pairs
 
+# Up to so many views, each gets a group of its own, with its best partners. That takes up to three times as long.
+OWN_GROUPS = 8
 NO_OVERLAP = 1e6  # more than the cost of any pair that sees something in common
 TINY = np.finfo(np.float64).tiny
 
@@ -23,14 +25,16 @@ class ViewGroup:
 def group_views(cameras: Sequence[Camera], depths: np.ndarray, size: int) -> list[ViewGroup]:
     """Groups of at most `size` views so that each view is used once, beside the views that suit it best.
 
-    A group grows from a view that has none yet: by the views without a group that make the best pairs with its own,
-    and then by the best partner that each of these lacks. Where there is no room for that, the view waits for the next
-    group. size: 3 or more. depths: of the scene in each camera, [cameras].
+    Up to OWN_GROUPS views, each is grouped with its best partners, and equal groups are one. Of more views, a group
+    grows from a view that has none yet: by the views without a group that make the best pairs with its own, and then by
+    the best partner that each of these lacks. Where there is no room for that, the view waits for the next group. size: 3 or more. depths: of the scene in each camera, [cameras].
     """
     count = len(cameras)
     if count <= size:
         return [ViewGroup(tuple(range(count)), tuple(range(count)))]
     cost = _pair_costs(cameras, depths)
+    if count <= OWN_GROUPS:
+        return _own_groups(cost, size)
     partners = cost.argmin(axis=1)
     left, groups = set(range(count)), []
     while left:
@@ -41,6 +45,15 @@ def group_views(cameras: Sequence[Camera], depths: np.ndarray, size: int) -> lis
         left -= set(used)
         groups.append(ViewGroup(tuple(sorted(views)), tuple(sorted(used))))
     return groups
+
+
+def _own_groups(cost: np.ndarray, size: int) -> list[ViewGroup]:
+    """The group of each view and the `size` - 1 others that make the best pairs with it; equal groups are one."""
+    partners = np.argsort(cost, axis=1, kind="stable")[:, : size - 1]
+    used: dict[tuple[int, ...], list[int]] = {}
+    for view, others in enumerate(partners):
+        used.setdefault(tuple(sorted({view, *others.tolist()})), []).append(view)
+    return [ViewGroup(views, tuple(own)) for views, own in used.items()]
 
 
 def nearest_views(cameras: Sequence[Camera], depths: np.ndarray, count: int) -> list[np.ndarray]:

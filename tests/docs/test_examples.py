@@ -11,7 +11,7 @@ import onnxruntime
 import pytest
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
-MODEL = Path(__file__).parents[2] / "runtime" / "inference" / "bundled" / "idesplat-tiny.onnx"
+MODEL = Path(__file__).parents[2] / "runtime" / "inference" / "bundled" / "idesplat-lite.onnx"
 VIEWS, SIDE = 2, 64
 NUMBERS = [str(VIEWS), str(SIDE), str(SIDE)]
 OUTPUTS = ("depth", "means", "scales", "quats", "opacities", "sh")

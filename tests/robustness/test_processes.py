@@ -85,7 +85,7 @@ def test_no_code_of_the_current_folder_runs_in_benchmarks(tmp_path):
     script = tmp_path.parent / f"{tmp_path.name}.py"
     script.write_text(code)
     done = subprocess.run([sys.executable, script], cwd=tmp_path, capture_output=True, text=True, timeout=300)
-    assert done.stdout == "idesplat-tiny-cross-view\n", done.stderr
+    assert done.stdout == "idesplat-lite\n", done.stderr
     assert not sprung.exists()
 
 

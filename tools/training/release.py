@@ -1,6 +1,6 @@
 """Export a trained checkpoint as the bundled model.
 
-    python -P -m idesplat.tools.training.release runs/tiny/last.ckpt
+    python -P -m idesplat.tools.training.release runs/head/last.ckpt
 
 The verified ONNX graph goes to `runtime/inference/bundled/`, with its checksum. It is one for the web, which is as fast
 elsewhere, so that the page of `idesplat web` can run it on WebGPU. The weights go to `bundled.safetensors` beside this
@@ -22,7 +22,7 @@ from ...runtime.cli.terminal import run
 from ...runtime.inference.bundled_model import CHECKSUM_SUFFIX, FOLDER, NAME
 from ...runtime.system.files import atomic_write, make_folder
 
-PRESET = "idesplat-tiny"
+PRESET = "idesplat-lite"
 WEIGHTS = Path(__file__).with_name("bundled.safetensors")
 
 

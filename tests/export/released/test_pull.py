@@ -92,7 +92,7 @@ def test_a_model_is_pulled_by_name_and_runs(hub: Hub, nano, kept_traces, tmp_pat
     assert run_command(models.main, "--json", "-") == 0
     listed = {row["name"]: row for row in json.loads(capsys.readouterr().out)}
     assert (listed[NAME]["state"], listed[NAME]["path"]) == ("cached", str(graph))
-    assert (listed["idesplat-tiny"]["state"], listed["idesplat-re10k"]["state"]) == ("bundled", "known")
+    assert (listed["idesplat-lite"]["state"], listed["idesplat-re10k"]["state"]) == ("bundled", "known")
 
 
 def test_a_download_is_kept_in_our_cache_and_not_repeated(hub: Hub, nano, content, tmp_path):
@@ -220,5 +220,5 @@ def test_an_unknown_name_lists_the_known_ones(capsys):
 
 
 def test_the_bundled_model_needs_no_download(capsys):
-    assert run_command(cli.main, "idesplat-tiny") == 0
-    assert capsys.readouterr().out.startswith("idesplat-tiny is bundled: ")
+    assert run_command(cli.main, "idesplat-lite") == 0
+    assert capsys.readouterr().out.startswith("idesplat-lite is bundled: ")

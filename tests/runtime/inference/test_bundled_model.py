@@ -13,7 +13,7 @@ def test_is_small_and_says_what_it_was_trained_on():
     path = module.bundled_model()
     assert path.stat().st_size <= LARGEST
     own = Predictor(path).metadata
-    assert (own.preset, own.height, own.width, own.near) == ("idesplat-tiny-cross-view", 256, 256, 1.0)
+    assert (own.preset, own.height, own.width, own.near) == ("idesplat-lite", 256, 256, 1.0)
     assert own.trained_views == [2, 3] and own.trained_sides == [128, 256]
     assert own.fixed_views == 0 and not own.fixed_size
 

@@ -45,8 +45,8 @@ def test_the_files_name_says_the_same(name):
 
 
 def test_no_model_is_the_bundled_one():
-    assert find_model() == find_model("idesplat-tiny") == bundled_model()
-    assert read_model("idesplat-tiny").path == bundled_model()
+    assert find_model() == find_model("idesplat-lite") == bundled_model()
+    assert read_model("idesplat-lite").path == bundled_model()
 
 
 def test_paths_are_left_alone(tmp_path, monkeypatch):
@@ -71,6 +71,6 @@ def test_an_unknown_name_lists_what_there_is(scene, tmp_path, capsys):
     assert run_command(infer.main, scene / "images", "--model", "idesplat-huge", "--out", out) == 2
     printed = capsys.readouterr().err
     assert printed.startswith("error: idesplat-huge: no such model; give a .onnx file or staged folder")
-    assert all(name in printed for name in ("idesplat-tiny", *KNOWN_MODELS))
+    assert all(name in printed for name in ("idesplat-lite", *KNOWN_MODELS))
     assert printed.count("\n") == 1
     assert not out.exists()

@@ -39,6 +39,18 @@ def test_few_views_are_one_group() -> None:
     assert group.views == group.used == (0, 1, 2, 3, 4, 5)
 
 
+def test_each_of_eight_views_is_beside_its_two_best_partners() -> None:
+    """Along a path those are its neighbours, or at an end the next two; nine views share groups."""
+    positions = np.random.default_rng(0).permutation(np.arange(8) * 0.8)
+    rank = np.argsort(np.argsort(positions))
+    groups = groups_of(positions, 3)
+    for group in groups:
+        for view in group.used:
+            middle = min(max(rank[view], 1), 6)
+            assert {rank[other] for other in group.views} == {middle - 1, middle, middle + 1}
+    assert len(groups) == 6 and len(groups_of(np.arange(9) * 0.8, 3)) < 9
+
+
 @pytest.mark.parametrize("size", [4, 6])
 def test_a_view_is_beside_its_best_partner(size: int) -> None:
     """Along a path, in any order of the images, each used view has one of its two neighbours in the group."""
