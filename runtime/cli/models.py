@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 WIDTH = 150  # columns, if the output is not a terminal
 BUNDLED_STATE, CACHED, KNOWN = "bundled", "cached", "known"
-BUNDLED_MILLIONS = 3.1  # parameters, which the metadata does not tell
+BUNDLED_MILLIONS = 3.0  # parameters, which the metadata does not tell
 
 
 @command("idesplat models")

@@ -27,7 +27,8 @@ def group_views(cameras: Sequence[Camera], depths: np.ndarray, size: int) -> lis
 
     Up to OWN_GROUPS views, each is grouped with its best partners, and equal groups are one. Of more views, a group
     grows from a view that has none yet: by the views without a group that make the best pairs with its own, and then by
-    the best partner that each of these lacks. Where there is no room for that, the view waits for the next group. size: 3 or more. depths: of the scene in each camera, [cameras].
+    the best partner that each of these lacks. Where there is no room for that, the view waits for the next group.
+    size: 3 or more. depths: of the scene in each camera, [cameras].
     """
     count = len(cameras)
     if count <= size:

@@ -12,7 +12,16 @@ from idesplat.export.example_inputs import room_inputs
 from idesplat.export.stages import NamedTensors, Stage
 from idesplat.export.tracing import StaticShape
 from idesplat.export.validation.cases import Case, verification_cases
-from idesplat.export.validation.compare import FUSED, STAGED, Exported, TensorError, compare, error_quantiles
+from idesplat.export.validation.compare import (
+    FUSED,
+    OWN_ERRORS,
+    STAGED,
+    Exported,
+    TensorError,
+    _own_bounds,
+    compare,
+    error_quantiles,
+)
 from idesplat.export.validation.report import print_details, print_summary
 from idesplat.model.family import ErrorQuantiles
 from idesplat.model.idesplat.family import IDESPLAT
@@ -261,6 +270,17 @@ def test_percentiles_see_a_border_that_the_median_does_not(depth):
     found[0, 0, :6] += 1  # 6 pixels of 2400
     assert figures(found, depth, 4)[:2] == (0, 0)
     assert figures(found, depth, 4).percentile_99_9 > 0.5
+
+
+def test_a_bound_grows_with_what_rounding_changes_in_the_network_itself(depth):
+    """OWN_ERRORS times its own error, if that is more than the bound, and never more than the bound end to end."""
+    bounds, most = TOLERANCE.stage, TOLERANCE.end_to_end
+    for own, median in ((0.0, bounds.median), (0.004, OWN_ERRORS * 0.004), (1.0, most.median)):
+        rounded = depth + np.float32(own) * depth.std((1, 2), keepdims=True)
+        case = Case("room", 4, {"depth": depth}, {"depth": rounded})
+        found = _own_bounds("depth", case, bounds, TOLERANCE)
+        assert found.median == pytest.approx(median, rel=0.05)
+        assert all(low <= value <= high for low, value, high in zip(bounds, found, most, strict=True))
 
 
 def test_single_pixels_may_jump(depth):
