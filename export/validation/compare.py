@@ -113,20 +113,22 @@ def _tensor_errors(
     tolerance: Tolerance,
 ) -> Iterator[TensorError]:
     for name in names:
-        values, expected = found[name], case.tensors[name]
-        with np.errstate(all="ignore"):  # NaN and infinity are outside every bound
-            if name in tolerance.scale_free and values.shape == expected.shape:
-                values = values * _relative_scale(values, expected)
-            errors, largest = error_quantiles(values, expected, case.views, tolerance.min_deviation)
+        errors, largest = _errors_of(name, found[name], case, tolerance)
         yield TensorError(case.name, stage, name, errors, _own_bounds(name, case, bounds, tolerance), largest)
+
+
+def _errors_of(name: str, values: np.ndarray, case: Case, tolerance: Tolerance) -> tuple[ErrorQuantiles, float]:
+    """The quantiles of a tensor's errors against the case's, and the largest, without the scale of scale-free ones."""
+    expected = case.tensors[name]
+    with np.errstate(all="ignore"):  # NaN and infinity are outside every bound
+        if name in tolerance.scale_free and values.shape == expected.shape:
+            values = values * _relative_scale(values, expected)
+        return error_quantiles(values, expected, case.views, tolerance.min_deviation)
 
 
 def _own_bounds(name: str, case: Case, bounds: ErrorQuantiles, tolerance: Tolerance) -> ErrorQuantiles:
     """The bounds of a tensor, raised where the network itself turns rounding into larger errors."""
-    rounded, expected = case.rounded[name], case.tensors[name]
-    if name in tolerance.scale_free:
-        rounded = rounded * _relative_scale(rounded, expected)
-    own, _ = error_quantiles(rounded, expected, case.views, tolerance.min_deviation)
+    own, _ = _errors_of(name, case.rounded[name], case, tolerance)
     limits = zip(bounds, own, tolerance.end_to_end, strict=True)
     return ErrorQuantiles(*(max(bound, min(OWN_ERRORS * error, most)) for bound, error, most in limits))
 

@@ -50,17 +50,20 @@ def group_views(cameras: Sequence[Camera], depths: np.ndarray, size: int) -> lis
 
 def _own_groups(cost: np.ndarray, size: int) -> list[ViewGroup]:
     """The group of each view and the `size` - 1 others that make the best pairs with it; equal groups are one."""
-    partners = np.argsort(cost, axis=1, kind="stable")[:, : size - 1]
     used: dict[tuple[int, ...], list[int]] = {}
-    for view, others in enumerate(partners):
+    for view, others in enumerate(_best_partners(cost, size - 1)):
         used.setdefault(tuple(sorted({view, *others.tolist()})), []).append(view)
     return [ViewGroup(views, tuple(own)) for views, own in used.items()]
 
 
 def nearest_views(cameras: Sequence[Camera], depths: np.ndarray, count: int) -> list[np.ndarray]:
     """The views that make the best pairs with each view, at most `count`, [cameras] arrays of indices."""
-    order = np.argsort(_pair_costs(cameras, depths), axis=1, kind="stable")
-    return list(order[:, : min(count, len(cameras) - 1)])
+    return list(_best_partners(_pair_costs(cameras, depths), min(count, len(cameras) - 1)))
+
+
+def _best_partners(cost: np.ndarray, count: int) -> np.ndarray:
+    """The `count` views of the lowest cost beside each view, best first, [cameras, count]."""
+    return np.argsort(cost, axis=1, kind="stable")[:, :count]
 
 
 def _pair_costs(cameras: Sequence[Camera], depths: np.ndarray) -> np.ndarray:

@@ -325,8 +325,7 @@ def _height(waves: np.ndarray, solid: int, x: float, z: float) -> float:
     """
     y = 0.0
     for wave in range(WAVES):
-        turn = waves[solid, wave, 0] * x + waves[solid, wave, 1] * z + waves[solid, wave, 2]
-        turn -= np.floor(turn + 0.5)
+        turn = _turn(waves, solid, wave, x, z)
         y += waves[solid, wave, 3] * 8.0 * turn * (1.0 - 2.0 * abs(turn))
     return y
 
@@ -336,11 +335,17 @@ def _height_slope(waves: np.ndarray, solid: int, x: float, z: float) -> tuple[fl
     """The derivatives of `_height` by x and z."""
     by_x, by_z = 0.0, 0.0
     for wave in range(WAVES):
-        turn = waves[solid, wave, 0] * x + waves[solid, wave, 1] * z + waves[solid, wave, 2]
-        turn -= np.floor(turn + 0.5)
+        turn = _turn(waves, solid, wave, x, z)
         slope = waves[solid, wave, 3] * 8.0 * (1.0 - 4.0 * abs(turn))
         by_x, by_z = by_x + slope * waves[solid, wave, 0], by_z + slope * waves[solid, wave, 1]
     return by_x, by_z
+
+
+@_inlined()
+def _turn(waves: np.ndarray, solid: int, wave: int, x: float, z: float) -> float:
+    """The phase of one wave at (x, z), in periods, from -1/2 to 1/2."""
+    turn = waves[solid, wave, 0] * x + waves[solid, wave, 1] * z + waves[solid, wave, 2]
+    return turn - np.floor(turn + 0.5)
 
 
 @_inlined()

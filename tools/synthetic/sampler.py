@@ -262,7 +262,7 @@ def _sample_depth_range(rng: np.random.Generator, depth: np.ndarray) -> tuple[fl
 def _simulate_camera(
     rng: np.random.Generator, image: np.ndarray, degrade: bool, variation: CameraVariation
 ) -> np.ndarray:
-    """The clipped image [height, width, 3]; `degrade` adds random exposure, white balance, blur, noise, JPEG."""
+    """The clipped image [height, width, 3]; `degrade` adds random exposure, white balance, blurs, noise, JPEG."""
     if degrade:
         image = image * np.float32(rng.uniform(1 - variation.exposure, 1 + variation.exposure))
         if variation.white_balance:

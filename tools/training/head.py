@@ -18,7 +18,7 @@ from ...model.idesplat.network import IDESplat
 from ...runtime.system.files import atomic_write, make_folder
 from ..synthetic.sampler import TRAINING_SEEDS
 from .data.samples import SampleSpec, TrainingViews
-from .data.synthetic import MAX_TARGET_ZOOM
+from .data.synthetic import MAX_TARGET_ZOOM, sample_view_count
 from .losses import offset_prior, photometric_loss
 from .perceptual import Perceptual
 from .step import PHOTOMETRIC_WEIGHT, psnr, render_targets, with_input_view
@@ -88,7 +88,7 @@ def cameras_of(views: TrainingViews) -> Cameras:
 def head_spec(seed: int, index: int, height: int, width: int, real_ratio: float) -> SampleSpec:
     """Scene number `index` of the set that a run with `seed` repeats. real_ratio: probability of a capture."""
     rng = np.random.default_rng((seed, index))
-    context = int(rng.choice(list(VIEW_COUNT_PROBABILITIES), p=list(VIEW_COUNT_PROBABILITIES.values())))
+    context = sample_view_count(rng, VIEW_COUNT_PROBABILITIES)
     scene = int(rng.integers(TRAINING_SEEDS.start, TRAINING_SEEDS.stop))
     target_zooms = (1, int(rng.integers(2, MAX_TARGET_ZOOM + 1)))
     return SampleSpec(scene, context, target_zooms, height, width, real=bool(rng.random() < real_ratio))

@@ -30,6 +30,8 @@ from .checkouts import frames_of
 from .scores import CaptureEvaluator
 
 LARGER = (384, 512)  # height and width of landscape frames
+# Share of a pixel that the smaller frame must cover.
+COVERED = 0.999
 COLUMNS = ("larger images", "enlarged", "rendered larger")
 
 
@@ -69,7 +71,7 @@ def enlarge(image: np.ndarray, targets: PosedImages, larger: PosedImages) -> tup
     matrix = np.linalg.inv(half) @ larger.K(0) @ np.linalg.inv(targets.K(0)) @ half
     shown = cv2.warpAffine(image, matrix[:2], (width, height), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     inside = cv2.warpAffine(targets.valid[0].astype(np.float32), matrix[:2], (width, height))
-    return shown, inside > 0.999
+    return shown, inside > COVERED
 
 
 def _capture_scores(evaluator: CaptureEvaluator, source: Capture, checkouts: Path) -> np.ndarray:

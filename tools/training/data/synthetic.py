@@ -18,6 +18,11 @@ VIEW_COUNT_PROBABILITIES = {2: 0.87, 3: 0.08, 4: 0.05}
 MAX_TARGET_ZOOM = 4
 
 
+def sample_view_count(rng: np.random.Generator, probabilities: dict[int, float]) -> int:
+    """A random number of context views. probabilities: by number."""
+    return int(rng.choice(list(probabilities), p=list(probabilities.values())))
+
+
 def training_spec(
     seed: int, step: int, slot: int, rendered: bool, height: int, width: int, more_views: bool, real_ratio: float = 0.0
 ) -> SampleSpec:
@@ -28,7 +33,7 @@ def training_spec(
     """
     # All scenes of a step have the same number of views, so that no process waits for another.
     of_step, rng = np.random.default_rng((seed, step)), np.random.default_rng((seed, step, slot))
-    context = int(of_step.choice(list(VIEW_COUNT_PROBABILITIES), p=list(VIEW_COUNT_PROBABILITIES.values())))
+    context = sample_view_count(of_step, VIEW_COUNT_PROBABILITIES)
     scene = int(rng.integers(TRAINING_SEEDS.start, TRAINING_SEEDS.stop))
     zooms = (1, int(rng.integers(2, MAX_TARGET_ZOOM + 1))) if rendered else ()
     return SampleSpec(scene, context if more_views else 2, zooms, height, width, real=bool(rng.random() < real_ratio))
