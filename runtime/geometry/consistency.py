@@ -1,5 +1,7 @@
 """Depth discontinuities within depth maps, and consistency between those of several views."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 DEPTH_TOLERANCE = 0.05  # relative difference in depth up to which two views agree
@@ -14,12 +16,17 @@ def depth_jumps(depth: np.ndarray) -> np.ndarray:
 
 
 def multi_view_consistency(
-    points: np.ndarray, depth: np.ndarray, extrinsics: np.ndarray, intrinsics: np.ndarray
+    points: np.ndarray,
+    depth: np.ndarray,
+    extrinsics: np.ndarray,
+    intrinsics: np.ndarray,
+    neighbors: Sequence[np.ndarray] | None = None,
 ) -> np.ndarray:
     """The fraction of the other views that agree with each point, float32 [views, height, width].
 
     points: world positions of the pixels, [views, height, width, 3]. depth: z-depth, [views, height, width].
-    extrinsics: camera-to-world, [views, 4, 4]. intrinsics: normalised, [views, 3, 3].
+    extrinsics: camera-to-world, [views, 4, 4]. intrinsics: normalised, [views, 3, 3]. neighbors: the views that are
+    asked about each view, as arrays of indices; by default all others.
     A view agrees with a point within 5 % of its own depth there, and disagrees with a point in front of that. It
     abstains on points outside its image, and on points behind its surface, which are occluded. Without votes a point
     gets 1.
@@ -32,7 +39,7 @@ def multi_view_consistency(
     for other, surface in enumerate(depth):
         nearest, farthest = cv2.erode(surface, square), cv2.dilate(surface, square)
         for view in range(len(depth)):
-            if view == other:
+            if view == other or (neighbors is not None and other not in neighbors[view]):
                 continue
             pixel, z, seen = project_to_view(points[view], surface.shape, extrinsics[other], intrinsics[other])
             behind_nearest = z >= nearest.ravel()[pixel] * (1 - DEPTH_TOLERANCE)

@@ -3,13 +3,15 @@
 A point is supported by a view whose depth and colour agree with it, and contradicted by a view that sees a surface
 behind it, or one of another colour at its place: that view looks through the point. What only one view sees is neither.
 Only a surface that is supported itself speaks against a point, so that a wrong depth map does not remove a right one.
-Of what is left, few copies of each surface stay.
+A point that most of the views that look there disagree with is removed as well.
+Of what is left, few copies of each surface stay: those of the views in the middle, which are less far from any camera.
 """
 
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
+from ..geometry.consistency import multi_view_consistency
 from ..system.compilation import compiled
 from ..system.threads import thread_count
 from .surfaces import Surfaces, project_to_pixel
@@ -19,6 +21,7 @@ ROUNDS = 3  # a point that is removed no longer contradicts others
 # A point is contradicted if the votes against it exceed VOTE_RATIO (MIN_SUPPORT + support).
 MIN_SUPPORT = 0.5
 VOTE_RATIO = 0.7
+MIN_CONSISTENCY = 0.5  # share of the neighbours with a surface at or before a point that must agree with it
 MIN_VOTING_VIEWS = 3  # with two views, a contradiction does not tell which of both is wrong
 COPIES = 2  # views whose points of one surface are kept
 COARSER = 1.5  # times the depth, from where a surface is sampled too coarsely to stand for another copy
@@ -45,18 +48,24 @@ def find_contradicted(surfaces: Surfaces) -> np.ndarray:
             solid = kept & (support > 0)
             list(pool.map(count_against, range(len(s.depth))))
             np.less_equal(against, VOTE_RATIO * (support + MIN_SUPPORT), out=kept)
-    return ~kept
+    consistency = multi_view_consistency(s.points, s.depth, s.extrinsics, s.intrinsics, s.neighbors)
+    return ~kept | (consistency < MIN_CONSISTENCY)
 
 
 def find_redundant(surfaces: Surfaces, kept: np.ndarray) -> np.ndarray:
-    """The points of surfaces that COPIES earlier views show as finely, bool [views, height, width].
+    """The points of surfaces that COPIES views show as finely that are nearer to the middle, bool [views, height, width].
 
     kept: the points that take part, bool [views, height, width]. More copies than that add nothing to the rendered
     views but time and memory, and small disagreements.
     """
     left = kept.copy()
-    for view, neighbors in enumerate(surfaces.neighbors):
-        earlier = neighbors[neighbors < view]
+    positions = surfaces.extrinsics[:, :3, 3]
+    to_others = np.linalg.norm(positions[:, None] - positions, axis=-1).sum(axis=1)
+    order = np.argsort(to_others, kind="stable")  # the views in the middle first
+    place = np.argsort(order)
+    for view in order.tolist():
+        neighbors = surfaces.neighbors[view]
+        earlier = neighbors[place[neighbors] < place[view]]
         if len(earlier) >= COPIES:
             _thin(surfaces.points[view], earlier, surfaces.depth, surfaces.viewmats, surfaces.Ks, left, view)
     return kept & ~left

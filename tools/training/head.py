@@ -21,13 +21,15 @@ from .data.samples import SampleSpec, TrainingViews
 from .data.synthetic import MAX_TARGET_ZOOM, sample_view_count
 from .losses import offset_prior, photometric_loss
 from .perceptual import Perceptual
-from .step import PHOTOMETRIC_WEIGHT, psnr, render_targets, with_input_view
+from .step import PHOTOMETRIC_WEIGHT, psnr, render_targets, with_input_views
 
 # The trained parts of the network: the Gaussian focused module with its input convolutions, and the head.
 HEAD_PARTS = ("conv_image", "fuse", "focus", "expand", "head1", "head2", "cross_view")
 HEAD_PREFIXES = tuple(f"gaussians.{part}." for part in HEAD_PARTS)
 # Numbers of context views, and their probabilities.
 VIEW_COUNT_PROBABILITIES = {2: 0.75, 3: 0.12, 4: 0.08, 6: 0.05}
+# Context views that are rendered beside the two target views.
+INPUT_VIEWS = 2
 # If the mean opacity is above the first value, the sigmoid is saturated and has no gradient. The mean is then reset to
 # the second value, and scales are multiplied by SCALE_GAIN, so that the more transparent Gaussians leave no gaps.
 SATURATED_OPACITY, START_OPACITY = 0.95, 0.5
@@ -105,19 +107,19 @@ def head_loss(
 ) -> tuple[Tensor, dict[str, float]]:
     """The loss of a sample, and what is logged.
 
-    Target views and one context view are rendered, that of number `step` modulo their count.
+    Target views and INPUT_VIEWS context views are rendered, from number `step` modulo their count on.
     """
     views = sample.views
     predicted = model.gaussians.predict(views.images, cameras_of(views), sample.inputs)
-    shown = with_input_view(views, step % len(views.images))
+    shown = with_input_views(views, step, INPUT_VIEWS)
     rendered = render_targets(predicted.gaussians, shown)
     photometric = photometric_loss(rendered, shown.target_images, perceptual)
     loss = PHOTOMETRIC_WEIGHT * photometric + offset_prior(predicted.raw)
-    novel, of_input = rendered.detach()[:-1], rendered.detach()[-1:]
+    novel, of_inputs = rendered.detach().split((len(rendered) - INPUT_VIEWS, INPUT_VIEWS))
     entry = {
         "loss": float(loss.detach()),
-        "psnr": psnr(novel, shown.target_images[:-1]),
-        "input_psnr": psnr(of_input, shown.target_images[-1:]),
+        "psnr": psnr(novel, shown.target_images[:-INPUT_VIEWS]),
+        "input_psnr": psnr(of_inputs, shown.target_images[-INPUT_VIEWS:]),
         "opacity": float(predicted.gaussians.opacities.detach().mean()),
     }
     return loss, entry

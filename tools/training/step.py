@@ -79,13 +79,14 @@ def render_targets(gaussians: tuple[Tensor, ...], views: TrainingViews) -> Tenso
     return torch.stack(images).permute(0, 3, 1, 2)
 
 
-def with_input_view(views: TrainingViews, index: int) -> TrainingViews:
-    """The same views, with one of the context views appended to the targets."""
+def with_input_views(views: TrainingViews, first: int, count: int = 1) -> TrainingViews:
+    """The same views, with `count` of the context views appended to the targets: from `first` on, in a circle."""
+    chosen = [(first + place) % len(views.images) for place in range(count)]
     return replace(
         views,
-        target_images=torch.cat([views.target_images, views.images[index : index + 1]]),
-        target_extrinsics=torch.cat([views.target_extrinsics, views.extrinsics[index : index + 1]]),
-        target_intrinsics=torch.cat([views.target_intrinsics, views.intrinsics[index : index + 1]]),
+        target_images=torch.cat([views.target_images, views.images[chosen]]),
+        target_extrinsics=torch.cat([views.target_extrinsics, views.extrinsics[chosen]]),
+        target_intrinsics=torch.cat([views.target_intrinsics, views.intrinsics[chosen]]),
     )
 
 
@@ -121,7 +122,7 @@ def scene_loss(
     `step` modulo their count.
     """
     if phase.gaussians:
-        views = with_input_view(views, step % len(views.images))
+        views = with_input_views(views, step)
     with record_correlations(model) as correlations:
         output = run_phase(model, views, phase)
     loss = torch.zeros(())

@@ -92,22 +92,29 @@ def test_colours_within_fine_texture_agree() -> None:
     assert not find_contradicted(surfaces(wall(4), images)).any()
 
 
-def test_two_views_of_a_surface_stay_and_of_the_others_what_these_do_not_see() -> None:
+def test_the_two_views_in_the_middle_stay_and_of_the_others_what_these_do_not_see() -> None:
     depth = wall(4)
     everything = np.ones(depth.shape, bool)
     redundant = find_redundant(surfaces(depth), everything)
-    assert not redundant[:2].any()
-    shift = 0.3 * WIDTH * float(K[0, 0]) / WALL  # pixels from view to view
-    inside = slice(1, int(WIDTH - 3 * shift) - 1)
-    assert redundant[2:, :, inside].all()
-    assert not redundant[3, :, WIDTH - int(shift) :].any()
+    assert not redundant[1:3].any()
+    shift = int(0.3 * WIDTH * float(K[0, 0]) / WALL) + 1  # pixels from view to view
+    assert redundant[0, :, 2 * shift :].all() and redundant[3, :, : WIDTH - 2 * shift].all()
+    assert not redundant[0, :, : shift - 1].any() and not redundant[3, :, WIDTH - shift + 1 :].any()
 
 
 def test_what_is_removed_counts_as_no_copy() -> None:
     kept = np.ones((4, HEIGHT, WIDTH), bool)
-    kept[0] = False
+    kept[1] = False
     redundant = find_redundant(surfaces(wall(4)), kept)
     assert not redundant[:3].any() and redundant[3].any()
+
+
+def test_a_point_that_most_views_disagree_with_goes_even_if_no_view_supports_theirs() -> None:
+    """Four views have the wall at four depths, so that nothing is supported: the nearest one goes."""
+    found = contradicted(wall(4) * np.array([0.5, 0.75, 0.9, 1.1])[:, None, None])
+    seen_by_others = slice(5, None)  # columns
+    assert found[0, :, seen_by_others].all()
+    assert not found[3].any()
 
 
 def test_a_nearer_view_of_a_surface_stays() -> None:

@@ -37,7 +37,7 @@ from idesplat.tools.training.run_files import CHECKPOINT, CURVES, LOG, PREDICTIO
 from idesplat.tools.training.schedule import Phase, lr_factor, phase_at, training_phases
 from idesplat.tools.training.settings import TrainingSettings
 from idesplat.tools.training.state import TrainingState
-from idesplat.tools.training.step import scene_loss, with_input_view
+from idesplat.tools.training.step import scene_loss, with_input_views
 from idesplat.tools.training.trainer import Trainer
 from shared_fixtures import build_once
 
@@ -122,7 +122,7 @@ def test_photometric_loss_by_hand() -> None:
 
 def test_a_context_view_is_appended_to_the_targets() -> None:
     views = generate_views(SampleSpec(11, 2, (1, 2), 32, 32))
-    shown = with_input_view(views, 1)
+    shown = with_input_views(views, 1)
     assert torch.equal(shown.target_images[:2], views.target_images) and len(shown.target_images) == 3
     assert torch.equal(shown.target_images[2], views.images[1])
     assert torch.equal(shown.target_extrinsics[2], views.extrinsics[1])
