@@ -3,7 +3,7 @@
 A point is supported by a view whose depth and colour agree with it, and contradicted by a view that sees a surface
 behind it, or one of another colour at its place: that view looks through the point. What only one view sees is neither.
 Only a surface that is supported itself speaks against a point, so that a wrong depth map does not remove a right one.
-A point that most of the views that look there disagree with is removed as well.
+So where all views disagree, none contradicts; a point that most of them disagree with is removed as well.
 Of what is left, few copies of each surface stay: those of the views in the middle, which are less far from any camera.
 """
 
@@ -28,7 +28,7 @@ COARSER = 1.5  # times the depth, from where a surface is sampled too coarsely t
 
 
 def find_contradicted(surfaces: Surfaces) -> np.ndarray:
-    """The points that other views see through, bool [views, height, width]."""
+    """The points that other views see through, or most disagree with, bool [views, height, width]."""
     s, shape = surfaces, surfaces.depth.shape
     colors, least, most = s.color_ranges
     support, against = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
@@ -53,7 +53,7 @@ def find_contradicted(surfaces: Surfaces) -> np.ndarray:
 
 
 def find_redundant(surfaces: Surfaces, kept: np.ndarray) -> np.ndarray:
-    """The points of surfaces that COPIES views show as finely that are nearer to the middle, bool [views, height, width].
+    """The points of surfaces that COPIES views nearer to the middle show as finely, bool [views, height, width].
 
     kept: the points that take part, bool [views, height, width]. More copies than that add nothing to the rendered
     views but time and memory, and small disagreements.
