@@ -21,7 +21,7 @@ ROUNDS = 3  # a point that is removed no longer contradicts others
 # A point is contradicted if the votes against it exceed VOTE_RATIO (MIN_SUPPORT + support).
 MIN_SUPPORT = 0.5
 VOTE_RATIO = 0.7
-MIN_CONSISTENCY = 0.5  # share of the neighbours with a surface at or before a point that must agree with it
+MIN_CONSISTENCY = 0.5  # share of the neighbours whose surface is at a point or behind it that must agree with it
 MIN_VOTING_VIEWS = 3  # with two views, a contradiction does not tell which of both is wrong
 COPIES = 2  # views whose points of one surface are kept
 COARSER = 1.5  # times the depth, from where a surface is sampled too coarsely to stand for another copy
@@ -58,10 +58,7 @@ def find_redundant(surfaces: Surfaces, kept: np.ndarray) -> np.ndarray:
     kept: the points that take part, bool [views, height, width]. More copies than that add nothing to the rendered
     views but time and memory, and small disagreements.
     """
-    left = kept.copy()
-    positions = surfaces.extrinsics[:, :3, 3]
-    to_others = np.linalg.norm(positions[:, None] - positions, axis=-1).sum(axis=1)
-    order = np.argsort(to_others, kind="stable")  # the views in the middle first
+    left, order = kept.copy(), _middle_first(surfaces.extrinsics)
     place = np.argsort(order)
     for view in order.tolist():
         neighbors = surfaces.neighbors[view]
@@ -69,6 +66,12 @@ def find_redundant(surfaces: Surfaces, kept: np.ndarray) -> np.ndarray:
         if len(earlier) >= COPIES:
             _thin(surfaces.points[view], earlier, surfaces.depth, surfaces.viewmats, surfaces.Ks, left, view)
     return kept & ~left
+
+
+def _middle_first(extrinsics: np.ndarray) -> np.ndarray:
+    """The views by the sum of their distances to the others, smallest first."""
+    positions = extrinsics[:, :3, 3]
+    return np.argsort(np.linalg.norm(positions[:, None] - positions, axis=-1).sum(axis=1), kind="stable")
 
 
 @compiled()

@@ -127,6 +127,9 @@ def test_a_context_view_is_appended_to_the_targets() -> None:
     assert torch.equal(shown.target_images[2], views.images[1])
     assert torch.equal(shown.target_extrinsics[2], views.extrinsics[1])
     assert torch.equal(shown.target_intrinsics[2], views.intrinsics[1])
+    both = with_input_views(views, 1, 2)
+    assert torch.equal(both.target_images[2:], views.images[[1, 0]])
+    assert torch.equal(both.target_extrinsics[2:], views.extrinsics[[1, 0]])
 
 
 def test_monocular_loss_is_scale_invariant() -> None:
