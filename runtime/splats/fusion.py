@@ -3,12 +3,14 @@
 A point is supported by a view whose depth and colour agree with it, and contradicted by a view that sees a surface
 behind it, or one of another colour at its place: that view looks through the point. What only one view sees is neither.
 Only a surface that is supported itself speaks against a point, so that a wrong depth map does not remove a right one.
-So where all views disagree, none contradicts; a point that most of them disagree with is removed as well.
+So where all views disagree, none contradicts; a point that most of them disagree with is removed as well, unless its
+own view would then have a hole there.
 Of what is left, few copies of each surface stay: those of the views in the middle, which are less far from any camera.
 """
 
 from concurrent.futures import ThreadPoolExecutor
 
+import cv2
 import numpy as np
 
 from ..geometry.consistency import multi_view_consistency
@@ -22,13 +24,18 @@ ROUNDS = 3  # a point that is removed no longer contradicts others
 MIN_SUPPORT = 0.5
 VOTE_RATIO = 0.7
 MIN_CONSISTENCY = 0.5  # share of the neighbours whose surface is at a point or behind it that must agree with it
+MIN_MAJORITY_VIEWS = 4  # from which on most views can outvote one; of three, two that disagree may both be wrong
 MIN_VOTING_VIEWS = 3  # with two views, a contradiction does not tell which of both is wrong
 COPIES = 2  # views whose points of one surface are kept
 COARSER = 1.5  # times the depth, from where a surface is sampled too coarsely to stand for another copy
 
 
 def find_contradicted(surfaces: Surfaces) -> np.ndarray:
-    """The points that other views see through, or most disagree with, bool [views, height, width]."""
+    """The points that other views see through, or most disagree with, bool [views, height, width].
+
+    Those that most disagree with count only with MIN_MAJORITY_VIEWS, and where points of the neighbours that are kept
+    cover their pixel.
+    """
     s, shape = surfaces, surfaces.depth.shape
     colors, least, most = s.color_ranges
     support, against = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
@@ -48,8 +55,11 @@ def find_contradicted(surfaces: Surfaces) -> np.ndarray:
             solid = kept & (support > 0)
             list(pool.map(count_against, range(len(s.depth))))
             np.less_equal(against, VOTE_RATIO * (support + MIN_SUPPORT), out=kept)
+    if len(s.depth) < MIN_MAJORITY_VIEWS:
+        return ~kept
     consistency = multi_view_consistency(s.points, s.depth, s.extrinsics, s.intrinsics, s.neighbors)
-    return ~kept | (consistency < MIN_CONSISTENCY)
+    agreed = kept & (consistency >= MIN_CONSISTENCY)
+    return ~kept | (kept & ~agreed & _covered(s, agreed))
 
 
 def find_redundant(surfaces: Surfaces, kept: np.ndarray) -> np.ndarray:
@@ -72,6 +82,35 @@ def _middle_first(extrinsics: np.ndarray) -> np.ndarray:
     """The views by the sum of their distances to the others, smallest first."""
     positions = extrinsics[:, :3, 3]
     return np.argsort(np.linalg.norm(positions[:, None] - positions, axis=-1).sum(axis=1), kind="stable")
+
+
+def _covered(surfaces: Surfaces, kept: np.ndarray) -> np.ndarray:
+    """The pixels of each view that kept points of its neighbours fall on, bool [views, height, width].
+
+    Gaps of a pixel between such points count as covered.
+    """
+    s, covered = surfaces, np.zeros(kept.shape, np.uint8)
+
+    def cover(view: int) -> None:
+        for neighbor in s.neighbors[view]:
+            _mark(s.points[neighbor], kept[neighbor], s.viewmats[view], s.Ks[view], covered[view])
+        covered[view] = cv2.morphologyEx(covered[view], cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+
+    with ThreadPoolExecutor(min(len(kept), thread_count())) as pool:
+        list(pool.map(cover, range(len(kept))))
+    return covered > 0
+
+
+@compiled()
+def _mark(points: np.ndarray, kept: np.ndarray, viewmat: np.ndarray, K: np.ndarray, covered: np.ndarray) -> None:
+    """Set the pixels of a view [height, width] that the kept points [height, width, 3] of another one fall on."""
+    height, width = covered.shape
+    for row in range(height):
+        for column in range(width):
+            if kept[row, column]:
+                _, y, x = project_to_pixel(points[row, column], viewmat, K, height, width)
+                if y >= 0:
+                    covered[y, x] = 1
 
 
 @compiled()

@@ -117,6 +117,19 @@ def test_a_point_that_most_views_disagree_with_goes_even_if_no_view_supports_the
     assert not found[3].any()
 
 
+def test_of_three_views_two_do_not_outvote_the_third() -> None:
+    assert not contradicted(wall(3) * np.array([0.5, 0.75, 0.9])[:, None, None]).any()
+
+
+def test_a_point_that_most_views_disagree_with_stays_where_no_other_view_covers_its_pixel() -> None:
+    """The depths of the test before, but the points of all other views lie behind the cameras."""
+    depth, extrinsics = wall(4) * np.array([0.5, 0.75, 0.9, 1.1])[:, None, None], cameras(4)
+    points = unproject(depth, extrinsics)
+    points[1:, ..., 2] *= -1
+    found = find_contradicted(Surfaces(points, depth, extrinsics, np.tile(K, (4, 1, 1))))
+    assert not found[0].any()
+
+
 def test_a_nearer_view_of_a_surface_stays() -> None:
     """It samples the surface more finely than those that stand farther away."""
     extrinsics = cameras(3) * 1.0
