@@ -1,5 +1,6 @@
 """Evaluation cases: context views for a network, and held-out target views."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -64,6 +65,8 @@ class EvalCase:
     [views, height, width], not positive where unknown; None without ground truth.
     covisible: whether some context view sees the surface at a target's pixel, bool [targets, height, width]; None
     without ground truth.
+    matched: whether another context view sees the surface at a context view's pixel, bool [views, height, width]; None
+    without ground truth.
     """
 
     name: str
@@ -73,6 +76,7 @@ class EvalCase:
     far: float
     depth: np.ndarray | None = None
     covisible: np.ndarray | None = None
+    matched: np.ndarray | None = None
 
 
 def synthetic_case(
@@ -96,17 +100,23 @@ def synthetic_case(
 
     given, held_out = posed("context", chosen), posed("target", slice(pool, None))
     depth = sample.depth[chosen]
-    covisible = find_covisible(unproject(sample.depth[pool:], held_out.extrinsics, held_out.intrinsics), depth, given)
-    return EvalCase(str(seed), given, held_out, sample.near, sample.far, depth, covisible)
+    views = range(context)
+    covisible = find_covisible(
+        unproject(sample.depth[pool:], held_out.extrinsics, held_out.intrinsics), depth, given, views
+    )
+    points = unproject(depth, given.extrinsics, given.intrinsics)
+    matched = np.stack([find_covisible(points[view], depth, given, {*views} - {view}) for view in views])
+    return EvalCase(str(seed), given, held_out, sample.near, sample.far, depth, covisible, matched)
 
 
-def find_covisible(points: np.ndarray, depth: np.ndarray, views: PosedImages) -> np.ndarray:
-    """Whether some view sees points [..., 3] in world coordinates, bool [...].
+def find_covisible(points: np.ndarray, depth: np.ndarray, views: PosedImages, asked: Iterable[int]) -> np.ndarray:
+    """Whether some of the views asked sees points [..., 3] in world coordinates, bool [...].
 
     depth: the views' true z-depth, [views, height, width]. A point is seen where it agrees with a view's depth.
     """
     seen = np.zeros(points.shape[:-1], bool)
-    for surface, extrinsics, intrinsics in zip(depth, views.extrinsics, views.intrinsics, strict=True):
-        pixel, z, inside = project_to_view(points, surface.shape, extrinsics, intrinsics)
+    for view in asked:
+        surface = depth[view]
+        pixel, z, inside = project_to_view(points, surface.shape, views.extrinsics[view], views.intrinsics[view])
         seen |= inside & (np.abs(surface.ravel()[pixel] - z) < SAME_SURFACE * z)
     return seen

@@ -126,17 +126,22 @@ def _as_metric(distance: "Perceptual") -> PerceptualMetric:
     return metric
 
 
-def depth_measures(depth: np.ndarray, truth: np.ndarray) -> dict[str, float]:
+def depth_measures(depth: np.ndarray, truth: np.ndarray, matched: np.ndarray | None = None) -> dict[str, float]:
     """AbsRel, delta < 1.25 and the inlier ratio at 1.05 of predicted depth.
 
-    AbsRel is the mean of |D - D*| / D*; the others are the shares of pixels with max(D / D*, D* / D) below a threshold.
+    AbsRel is the mean of |D / D* - 1|; the others are the shares of pixels with max(D / D*, D* / D) below a threshold.
     depth, truth: z-depth, [views, height, width]. Pixels whose true depth is not positive and finite are left out.
+    matched: the pixels whose surface another view sees, bool [views, height, width]; AbsRel of these is given, too.
     """
     known = np.isfinite(truth) & (truth > 0)
     ratio = depth[known].astype(np.float64) / truth[known]
     worst = np.maximum(ratio, np.divide(1, ratio, out=np.full_like(ratio, np.inf), where=ratio > 0))
-    return {
-        "abs_rel": float(np.abs(ratio - 1).mean()),
+    error = np.abs(ratio - 1)
+    measures = {
+        "abs_rel": float(error.mean()),
         "delta_1.25": float((worst < DELTA).mean()),
         "inlier_ratio_1.05": float((worst < INLIER).mean()),
     }
+    if matched is not None and matched[known].any():
+        measures["abs_rel_covisible"] = float(error[matched[known]].mean())
+    return measures

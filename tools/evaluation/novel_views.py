@@ -94,7 +94,7 @@ class Evaluator:
             targets.append(Target(name, scores, details))
             if show is not None:
                 show(name, comparison_strip(truth, valid, rendering, images.get(ORACLE_PLANE)))
-        depth = {} if case.depth is None else depth_measures(prediction.depth, case.depth)
+        depth = {} if case.depth is None else depth_measures(prediction.depth, case.depth, case.matched)
         return Result(case.name, given.names, case.near, case.far, targets, depth)
 
     def _baselines(
@@ -149,10 +149,13 @@ def render_target(gaussians: Gaussians, targets: PosedImages, view: int, near_pl
 
 
 def _mean(entries: list[Scores]) -> Scores:
-    """The mean of entries with the same methods and metrics."""
+    """The mean of entries with the same methods; of each metric over those that have it."""
     return {
-        method: {measure: float(np.mean([entry[method][measure] for entry in entries])) for measure in measures}
-        for method, measures in entries[0].items()
+        method: {
+            measure: float(np.mean([entry[method][measure] for entry in entries if measure in entry[method]]))
+            for measure in dict.fromkeys(measure for entry in entries for measure in entry[method])
+        }
+        for method in entries[0]
     }
 
 

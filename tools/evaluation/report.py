@@ -25,6 +25,7 @@ TITLES = {
     LPIPS: "LPIPS",
     LITE0: LITE0_TITLE,
     "abs_rel": "AbsRel",
+    "abs_rel_covisible": "AbsRel co-visible",
     "delta_1.25": "delta < 1.25",
     "inlier_ratio_1.05": "inlier ratio at 1.05",
 }

@@ -149,7 +149,7 @@ def test_covisible_points_are_neither_occluded_nor_outside_the_image() -> None:
         (right, y, -DEPTH): False,
     }
     points = np.array([[point(*place) for place in expected]])
-    np.testing.assert_array_equal(find_covisible(points, depth, views), [list(expected.values())])
+    np.testing.assert_array_equal(find_covisible(points, depth, views, range(len(depth))), [list(expected.values())])
 
 
 def test_zoomed_views_need_larger_splats() -> None:

@@ -84,6 +84,9 @@ def test_depth_measures_by_hand() -> None:
     assert found["delta_1.25"] == pytest.approx(3 / 4)  # 2 / 1.5 is above
     assert found["inlier_ratio_1.05"] == pytest.approx(1 / 4)  # 1 / 0.951 is above
     assert depth_measures(np.zeros((1, 2, 2)), np.ones((1, 2, 2)))["delta_1.25"] == 0
+    matched = np.array([[[True, False, True, False, True, True, True]]])
+    found = depth_measures(np.array([[[1.02, 1.5, 4.5, 0.951, 9.0, 9.0, 9.0]]], np.float32), truth, matched)
+    assert found["abs_rel_covisible"] == pytest.approx((0.02 + 0.125) / 2, rel=1e-5)
 
 
 @pytest.mark.parametrize("package", ["torch", "lpips"])
