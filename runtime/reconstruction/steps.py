@@ -41,7 +41,7 @@ class Plan:
     def refinement(self, views: int) -> RefinementOptions:
         """The options of the refinement on so many views."""
         limit = self.limit or self.preset.limit(views)
-        return prediction_options(views, steps=limit.steps, seconds=limit.seconds, max_gaussians=self.max_gaussians)
+        return prediction_options(limit.steps, seconds=limit.seconds, max_gaussians=self.max_gaussians)
 
 
 @dataclass(frozen=True)

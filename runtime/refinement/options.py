@@ -6,9 +6,7 @@ from typing import Any
 # How the Gaussians of a feed-forward prediction start, measured on held-out views of real captures
 # (docs/reconstruction.md). The network's are small and opaque, so that a layer that is nearer by a hair hides the
 # others; larger ones that let light through have gradients and average.
-FEW_VIEWS = 2
-FEW_VIEWS_OPACITY, FEW_VIEWS_SCALE = 0.5, 2.0
-MANY_VIEWS_OPACITY, MANY_VIEWS_SCALE = 0.35, 1.8
+PREDICTION_OPACITY, PREDICTION_SCALE = 0.2, 2.0
 
 # Learning rate of poses where they are refined.
 POSE_LR = 3e-4
@@ -34,21 +32,19 @@ class RefinementOptions:
     max_opacity: float = 0.99
     scale_factor: float = 1.0
     ssim_weight: float = 0.2
-    lr_means: float = 1.2e-3
+    lr_means: float = 2e-3
     lr_scales: float = 6e-2
     lr_quats: float = 1.2e-2
     lr_opacities: float = 0.3
-    lr_dc: float = 3e-2
+    lr_dc: float = 1e-2
     lr_sh: float = 6e-3
     lr_exposure: float = 1e-3
     lr_poses: float = 0.0
     final_lr: float = 0.1
 
 
-def prediction_options(views: int, steps: int, **options: Any) -> RefinementOptions:
-    """The options for a prediction of so many views; without steps, it is left as it is but for `max_gaussians`."""
+def prediction_options(steps: int, **options: Any) -> RefinementOptions:
+    """The options for a prediction; without steps, it is left as it is but for `max_gaussians`."""
     if not steps:
         return RefinementOptions(steps=0, max_opacity=1, **options)
-    if views <= FEW_VIEWS:
-        return RefinementOptions(steps=steps, max_opacity=FEW_VIEWS_OPACITY, scale_factor=FEW_VIEWS_SCALE, **options)
-    return RefinementOptions(steps=steps, max_opacity=MANY_VIEWS_OPACITY, scale_factor=MANY_VIEWS_SCALE, **options)
+    return RefinementOptions(steps=steps, max_opacity=PREDICTION_OPACITY, scale_factor=PREDICTION_SCALE, **options)
