@@ -20,6 +20,7 @@ from .view_adam import ViewAdam
 
 MAX_TRANSMITTANCE = 0.5  # of a pixel that counts as covered
 DEFAULT = RefinementOptions()
+COARSE = 3.0  # times the median size in the images, from where a Gaussian is one of a backdrop
 PRUNE_AFTER = 0.6  # of the steps, so that the others make up for what is removed
 
 
@@ -105,7 +106,7 @@ class Optimiser:
 
     def __init__(self, gaussians: Gaussians, views: Sequence[PosedImage], options: RefinementOptions) -> None:
         self.options = options
-        self.parameters = _parameters(gaussians, options)
+        self.parameters = _parameters(gaussians, views, options)
         self.rasterizer = GradientRasterizer(self.parameters)
         self.depth = _median_depth(self.parameters, views)
         self.lr = _learning_rates(self.parameters, self.depth, options)
@@ -172,11 +173,23 @@ def _covered(view: PosedImage, done: Pass) -> PosedImage:
     return replace(view, valid=view.valid & (done.transmittance < MAX_TRANSMITTANCE))
 
 
-def _parameters(gaussians: Gaussians, options: RefinementOptions) -> Parameters:
-    opacities = np.clip(gaussians.opacities, 1e-4, options.max_opacity).astype(np.float64)
+def _parameters(gaussians: Gaussians, views: Sequence[PosedImage], options: RefinementOptions) -> Parameters:
+    """The Gaussians as they start. A backdrop keeps its opacity: nothing behind it should show, least of all black."""
+    most = np.where(_coarse(gaussians, views), max(DEFAULT.max_opacity, options.max_opacity), options.max_opacity)
+    opacities = np.clip(gaussians.opacities, 1e-4, most).astype(np.float64)
     scales = np.maximum(gaussians.scales.astype(np.float64) * options.scale_factor, 1e-12)
     arrays = (gaussians.means, gaussians.quats, np.log(scales), np.log(opacities / (1 - opacities)), gaussians.sh)
     return Parameters(*(np.array(array, np.float32, order="C") for array in arrays))
+
+
+def _coarse(gaussians: Gaussians, views: Sequence[PosedImage]) -> np.ndarray:
+    """The Gaussians that are COARSE times as large in the images as most, by their shortest axis, bool [gaussians]."""
+    sizes = np.full(len(gaussians.means), np.inf, np.float32)
+    for view in views:
+        z = gaussians.means @ view.viewmat[2, :3].astype(np.float32) + np.float32(view.viewmat[2, 3])
+        seen = z > 0
+        sizes[seen] = np.minimum(sizes[seen], gaussians.scales[seen].min(axis=1) / z[seen])
+    return sizes > COARSE * np.median(sizes)
 
 
 def _gaussians(parameters: Parameters) -> Gaussians:

@@ -27,8 +27,8 @@ class FilterOptions:
         boundaries, where depth maps put points between foreground and background. 0 for no limit.
     min_consistency: those of pixels whose depth is confirmed by a smaller fraction of the other views, 0 to 1; see
         `geometry.consistency.multi_view_consistency`.
-    remove_contradicted: those that other views see through, or most disagree with, with three views or more; see
-        `fusion.find_contradicted`.
+    remove_contradicted: those that other views see through, with three views or more, and with four those that most
+        disagree with; see `fusion.find_contradicted`.
     merge_duplicates: merge Gaussians that different views predict at the same point of a surface into one.
     remove_redundant: those of surfaces that two other views show; see `fusion.find_redundant`.
     close_holes: fit shapes to the surface, and continue background behind depth edges; see `holes.close_holes`.

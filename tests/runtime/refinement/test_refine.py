@@ -166,3 +166,20 @@ def test_an_empty_scene_renders_as_nothing() -> None:
     empty = Parameters(*(np.zeros((0, *shape), np.float32) for shape in ((3,), (4,), (3,), (), (1, 3))))
     view = PosedImage(np.zeros((8, 8, 3), np.float32), np.eye(4), K, np.ones((8, 8), bool))
     assert not GradientRasterizer(empty).forward(view.target).rgb.any()
+
+
+def test_a_backdrop_keeps_its_opacity_where_others_start_with_less(views: list[PosedImage]) -> None:
+    """So that no black shows through where nothing stands before it."""
+    small = scene(0)
+    backdrop = Gaussians(
+        means=np.array([[0, 0, 8]], np.float32),
+        scales=np.full((1, 3), 4.0, np.float32),
+        quats=np.float32([[1, 0, 0, 0]]),
+        opacities=np.float32([0.95]),
+        sh=np.zeros((1, 1, 3), np.float32),
+    )
+    options = RefinementOptions(steps=1, max_opacity=0.2, lr_opacities=0)
+    refined = refine(Gaussians.concatenate([small, backdrop]), views, options).gaussians
+    large = refined.scales[:, 0] > 1
+    assert refined.opacities[large] == pytest.approx(0.95, abs=1e-3)
+    assert refined.opacities[~large] == pytest.approx(0.2, abs=1e-3)
