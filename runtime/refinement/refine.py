@@ -184,11 +184,11 @@ def _parameters(gaussians: Gaussians, views: Sequence[PosedImage], options: Refi
 
 def _coarse(gaussians: Gaussians, views: Sequence[PosedImage]) -> np.ndarray:
     """The Gaussians that are COARSE times as large in the images as most, by their shortest axis, bool [gaussians]."""
-    sizes = np.full(len(gaussians.means), np.inf, np.float32)
+    shortest, sizes = gaussians.scales.min(axis=1), np.full(len(gaussians.means), np.inf, np.float32)
     for view in views:
-        z = gaussians.means @ view.viewmat[2, :3].astype(np.float32) + np.float32(view.viewmat[2, 3])
+        z = _depths(gaussians.means, view)
         seen = z > 0
-        sizes[seen] = np.minimum(sizes[seen], gaussians.scales[seen].min(axis=1) / z[seen])
+        sizes[seen] = np.minimum(sizes[seen], shortest[seen] / z[seen])
     return sizes > COARSE * np.median(sizes)
 
 
@@ -202,9 +202,14 @@ def _gaussians(parameters: Parameters) -> Gaussians:
 def _median_depth(parameters: Parameters, views: Sequence[PosedImage]) -> float:
     depths: list[float] = []
     for view in views:
-        z = parameters.means @ view.viewmat[2, :3].astype(np.float32) + np.float32(view.viewmat[2, 3])
+        z = _depths(parameters.means, view)
         depths.append(float(np.median(z[z > 0])) if (z > 0).any() else 1.0)
     return float(np.median(depths))
+
+
+def _depths(means: np.ndarray, view: PosedImage) -> np.ndarray:
+    """The z-depth of means [gaussians, 3] in a view, [gaussians]."""
+    return means @ view.viewmat[2, :3].astype(np.float32) + np.float32(view.viewmat[2, 3])
 
 
 def _learning_rates(parameters: Parameters, depth: float, options: RefinementOptions) -> np.ndarray:

@@ -59,7 +59,7 @@ def find_contradicted(surfaces: Surfaces) -> np.ndarray:
         return ~kept
     consistency = multi_view_consistency(s.points, s.depth, s.extrinsics, s.intrinsics, s.neighbors)
     agreed = kept & (consistency >= MIN_CONSISTENCY)
-    return ~kept | (kept & ~agreed & _covered(s, agreed))
+    return ~kept | (~agreed & _covered(s, agreed))
 
 
 def find_redundant(surfaces: Surfaces, kept: np.ndarray) -> np.ndarray:
