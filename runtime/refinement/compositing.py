@@ -35,18 +35,16 @@ def count_entries(
     boxes: np.ndarray,
     offsets: np.ndarray,  # [gaussians]: each one's first entry
     entries: np.ndarray,  # [bands], zeros: how many there are
-    pixels: np.ndarray,  # [bands], zeros: in the boxes of the entries, and so at most as many fragments
 ) -> int:
     """Fill what the entries need; returns the number of all."""
     total = 0
     for index in range(len(boxes)):
         offsets[index] = total
-        left, right, top, bottom = boxes[index, 0], boxes[index, 1], boxes[index, 2], boxes[index, 3]
+        top, bottom = boxes[index, 2], boxes[index, 3]
         if bottom <= top:
             continue
         for band in range(top // BAND_ROWS, (bottom - 1) // BAND_ROWS + 1):
             entries[band] += 1
-            pixels[band] += (right - left) * (min(bottom, (band + 1) * BAND_ROWS) - max(top, band * BAND_ROWS))
             total += 1
     return total
 
@@ -97,27 +95,35 @@ def composite(
     boxes: np.ndarray,
     band: int,
     fragment: int,
-    image: np.ndarray,  # [height, width, 3], zeros
-    transmittance: np.ndarray,  # [height, width], ones
+    image: np.ndarray,  # [height, width, 3], zeros before a band's first entry
+    transmittance: np.ndarray,  # [height, width], ones before a band's first entry
     ends: np.ndarray,  # [entries]: the fragment after an entry's last one
     pixels: np.ndarray,  # [fragments] int32: row * width + column
     alphas: np.ndarray,  # [fragments]
-) -> None:
+) -> tuple[int, int]:
     """Composite the entries of a band from `start` to `stop`, and record their fragments from `fragment` on.
 
-    A pixel is closed while its transmittance is negative.
+    A pixel is closed while its transmittance is negative. Returns where to go on: `stop` and the number of fragments,
+    or before that the first entry whose fragments might not fit, and the next fragment.
     """
     height, width = transmittance.shape
     first_row, end_row = band * BAND_ROWS, min((band + 1) * BAND_ROWS, height)
+    still_open = (transmittance[first_row:end_row] >= 0).sum()
     for place in range(start, stop):
+        if not still_open:
+            ends[place:stop] = fragment
+            break
         index = np.int64(keys[place] & GAUSSIAN_MASK)
+        left, right = boxes[index, 0], boxes[index, 1]
+        top, bottom = max(boxes[index, 2], first_row), min(boxes[index, 3], end_row)
+        if fragment + (bottom - top) * (right - left) > len(pixels):
+            return place, fragment
         values = projected[index]
         x, y, opacity = values[X], values[Y], values[OPACITY]
         xx, xy, yy = values[CONIC_XX], values[CONIC_XY], values[CONIC_YY]
         red, green, blue = values[RED], values[GREEN], values[BLUE]
         reach = np.log(opacity) - np.float32(LOG_MIN_ALPHA)
-        left, right = boxes[index, 0], boxes[index, 1]
-        for row in range(max(boxes[index, 2], first_row), min(boxes[index, 3], end_row)):
+        for row in range(top, bottom):
             dy = np.float32(row) + np.float32(0.5) - y
             low, high = _row_span(xx, xy, yy, reach, dy)
             # Truncation is floor here: what is below zero is left of the box.
@@ -135,6 +141,7 @@ def composite(
                 after = before * (np.float32(1) - alpha)
                 if after <= np.float32(MIN_TRANSMITTANCE):
                     transmittance[row, column] = -before
+                    still_open -= 1
                     continue
                 weight = alpha * before
                 image[row, column, 0] += weight * red
@@ -148,6 +155,7 @@ def composite(
     for row in range(first_row, end_row):
         for column in range(width):
             transmittance[row, column] = abs(transmittance[row, column])
+    return stop, fragment
 
 
 @compiled_finite
@@ -158,7 +166,6 @@ def composite_backward(
     projected: np.ndarray,
     boxes: np.ndarray,
     band: int,
-    fragment: int,
     ends: np.ndarray,
     pixels: np.ndarray,
     alphas: np.ndarray,
@@ -182,7 +189,7 @@ def composite_backward(
         red, green, blue = values[RED], values[GREEN], values[BLUE]
         for_red, for_green, for_blue, total = zero, zero, zero, zero
         sum_g, sum_x, sum_y, sum_xx, sum_xy, sum_yy = zero, zero, zero, zero, zero, zero
-        for one in range(ends[place - 1] if place > start else fragment, ends[place]):
+        for one in range(ends[place - 1] if place > start else 0, ends[place]):
             pixel, alpha = pixels[one], alphas[one]
             row = pixel // width
             column = pixel - row * width

@@ -13,6 +13,7 @@ from . import compositing, kernels
 NEAR = 0.01  # world units
 MOST_THREADS = 8
 BLOCK = 1 << 13  # Gaussians of one task
+FIRST_FRAGMENTS = 1 << 14  # for which a band has room at first
 BETA_1, BETA_2 = 0.9, 0.999  # of Adam, as 3DGS has them
 
 
@@ -68,16 +69,33 @@ class Pass:
 class Entries:
     """The entries of a pass and their fragments, as `compositing` describes them.
 
-    keys: sorted in each band. starts: each band's first entry, and the number of all. fragments: the same of its
-    fragments. ends: the fragment after an entry's last one. pixels, alphas: of the fragments.
+    keys: sorted in each band. starts: each band's first entry, and the number of all. ends: the fragment of its band
+    after an entry's last one. fragments: each band's.
     """
 
     keys: np.ndarray
     starts: np.ndarray
-    fragments: np.ndarray
     ends: np.ndarray
+    fragments: "list[Fragments]"
+
+
+@dataclass(frozen=True, eq=False)
+class Fragments:
+    """Room for the fragments of a band: their pixels and alphas."""
+
     pixels: np.ndarray
     alphas: np.ndarray
+
+    @classmethod
+    def empty(cls, count: int, dtype: np.dtype) -> "Fragments":
+        """Room for so many."""
+        return cls(np.empty(count, np.int32), np.empty(count, dtype))
+
+    def enlarged(self) -> "Fragments":
+        """Twice the room, with the same fragments first."""
+        larger = Fragments.empty(2 * len(self.pixels), self.alphas.dtype)
+        larger.pixels[: len(self.pixels)], larger.alphas[: len(self.alphas)] = self.pixels, self.alphas
+        return larger
 
 
 def compile_all() -> None:
@@ -106,7 +124,7 @@ class GradientRasterizer:
         self._projected = np.zeros((count, compositing.PROJECTED), dtype)
         self._boxes = np.zeros((count, 4), np.int32)
         self._offsets = np.zeros(count, np.int64)
-        self._pixels, self._alphas = np.empty(0, np.int32), np.empty(0, dtype)
+        self._fragments: list[Fragments] = []  # kept from pass to pass: memory that was never used costs time
 
     def forward(self, target: Target) -> Pass:
         """Render a view. The pass is valid until the next one."""
@@ -125,28 +143,32 @@ class GradientRasterizer:
         rgb, transmittance = np.zeros((height, width, 3), dtype), np.ones((height, width), dtype)
 
         def composite(band: int) -> None:
-            start, stop = e.starts[band], e.starts[band + 1]
-            e.keys[start:stop].sort()
-            compositing.composite(
-                e.keys, start, stop, projected, boxes, band, e.fragments[band],
-                rgb, transmittance, e.ends, e.pixels, e.alphas,
-            )  # fmt: skip
+            place, stop, fragment = e.starts[band], e.starts[band + 1], 0
+            e.keys[place:stop].sort()
+            while True:
+                room = e.fragments[band]
+                place, fragment = compositing.composite(
+                    e.keys, place, stop, projected, boxes, band, fragment,
+                    rgb, transmittance, e.ends, room.pixels, room.alphas,
+                )  # fmt: skip
+                if place == stop:
+                    return
+                e.fragments[band] = room.enlarged()
 
         self._over_bands(composite, len(e.starts) - 1)
         return Pass(rgb, transmittance, projected, boxes, self._offsets, e, target)
 
     def _entries(self, bands: int) -> Entries:
-        """The entries of the projected Gaussians, unsorted, with room for their fragments."""
-        entries, pixels = np.zeros(bands, np.int64), np.zeros(bands, np.int64)
-        total = compositing.count_entries(self._boxes, self._offsets, entries, pixels)
-        starts, fragments = (np.concatenate([[0], np.cumsum(counts)]) for counts in (entries, pixels))
+        """The entries of the projected Gaussians, unsorted, without fragments."""
+        entries = np.zeros(bands, np.int64)
+        total = compositing.count_entries(self._boxes, self._offsets, entries)
+        starts = np.concatenate([[0], np.cumsum(entries)])
         keys = np.empty(total, np.uint64)
         depth_bits = self._projected[:, compositing.DEPTH].astype(np.float32).view(np.uint32).astype(np.uint64)
         compositing.fill_keys(self._boxes, depth_bits, starts, keys)
-        if len(self._pixels) < fragments[-1]:  # kept from pass to pass: memory that was never used costs time
-            self._pixels = np.empty(fragments[-1], np.int32)
-            self._alphas = np.empty(fragments[-1], self._projected.dtype)
-        return Entries(keys, starts, fragments, np.empty(total, np.int64), self._pixels, self._alphas)
+        while len(self._fragments) < bands:
+            self._fragments.append(Fragments.empty(FIRST_FRAGMENTS, self._projected.dtype))
+        return Entries(keys, starts, np.empty(total, np.int64), self._fragments)
 
     def backward(self, done: Pass, for_rgb: np.ndarray, for_transmittance: np.ndarray | None = None) -> np.ndarray:
         """Gradients of the entries of a pass from those of its rgb and transmittance."""
@@ -158,8 +180,9 @@ class GradientRasterizer:
 
         def composite_backward(band: int) -> None:
             compositing.composite_backward(
-                e.keys, e.starts[band], e.starts[band + 1], done.projected, done.boxes, band, e.fragments[band],
-                e.ends, e.pixels, e.alphas, done.offsets, for_rgb, behind, through, gradients,
+                e.keys, e.starts[band], e.starts[band + 1], done.projected, done.boxes, band,
+                e.ends, e.fragments[band].pixels, e.fragments[band].alphas,
+                done.offsets, for_rgb, behind, through, gradients,
             )  # fmt: skip
 
         self._over_bands(composite_backward, len(e.starts) - 1)

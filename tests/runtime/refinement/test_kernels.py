@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from idesplat.runtime.refinement import rasterizer as rasterizer_module
 from idesplat.runtime.refinement.losses import photometric_loss
 from idesplat.runtime.refinement.poses import move_world
 from idesplat.runtime.refinement.rasterizer import GradientRasterizer, Parameters, Target
@@ -56,7 +57,30 @@ def test_renders_as_gsplat_does(case: str) -> None:
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_gradients_are_those_of_the_rasteriser_in_pytorch(degree: int) -> None:
-    parameters, target = random_parameters(degree, 300, degree), side_view()
+    check_gradients(random_parameters(degree, 300, degree), side_view())
+
+
+def test_gradients_with_little_room_for_fragments(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The room of a band is enlarged while the band is composited."""
+    monkeypatch.setattr(rasterizer_module, "FIRST_FRAGMENTS", 1)
+    check_gradients(random_parameters(1, 300, 1), side_view())
+
+
+def test_gradients_behind_a_wall_that_stops_all_light() -> None:
+    """A band ends before its last entries, which get no gradient."""
+    parameters = random_parameters(1, 300, 1)
+    wall = np.arange(8)
+    parameters.means[wall] = np.stack([0.0 * wall, 0.0 * wall, 0.5 + 0.1 * wall], axis=1)
+    parameters.log_scales[wall] = np.log([8.0, 8.0, 0.01])
+    parameters.quats[wall] = 1, 0, 0, 0
+    parameters.logits[wall] = 2  # opacity 0.88: after four, 2e-4 of the light is left; a fifth would leave too little
+    parameters.means[len(wall) :, 2] = np.maximum(parameters.means[len(wall) :, 2], 1.5)
+    gradients = check_gradients(parameters, side_view())
+    assert (gradients != 0).any(axis=1).nonzero()[0].tolist() == [0, 1, 2, 3]
+
+
+def check_gradients(parameters: Parameters, target: Target) -> np.ndarray:
+    """Compare rendering and gradients with PyTorch's; ours, [gaussians, columns]."""
     rng = np.random.default_rng(7)
     for_rgb = rng.normal(size=(target.height, target.width, 3)).astype(np.float32)
     for_light = rng.normal(size=(target.height, target.width)).astype(np.float32)
@@ -80,6 +104,7 @@ def test_gradients_are_those_of_the_rasteriser_in_pytorch(degree: int) -> None:
     for name, columns in {**GROUPS, "sh": slice(11, None)}.items():
         largest = np.abs(theirs[:, columns]).max()
         np.testing.assert_allclose(ours[:, columns], theirs[:, columns], rtol=0, atol=1e-5 * largest, err_msg=name)
+    return ours
 
 
 def test_gradients_match_finite_differences() -> None:
