@@ -4,10 +4,11 @@ A point is supported by a view whose depth and colour agree with it, and contrad
 behind it, or one of another colour at its place: that view looks through the point. What only one view sees is neither.
 Only a surface that is supported itself speaks against a point, so that a wrong depth map does not remove a right one.
 So where all views disagree, none contradicts; a point that most of them disagree with is removed as well, unless its
-own view would then have a hole there.
+own view would then have a hole there, and it hides the surfaces of few others.
 Of what is left, few copies of each surface stay: those of the views in the middle, which are less far from any camera.
 """
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import cv2
@@ -24,6 +25,7 @@ ROUNDS = 3  # a point that is removed no longer contradicts others
 MIN_SUPPORT = 0.5
 VOTE_RATIO = 0.7
 MIN_CONSISTENCY = 0.5  # share of the neighbours whose surface is at a point or behind it that must agree with it
+MANY_HIDDEN = 6  # views whose surfaces a point hides, from where it does more harm than the hole that it leaves
 MIN_MAJORITY_VIEWS = 4  # from which on most views can outvote one; of three, two that disagree may both be wrong
 MIN_VOTING_VIEWS = 3  # with two views, a contradiction does not tell which of both is wrong
 COPIES = 2  # views whose points of one surface are kept
@@ -33,33 +35,54 @@ COARSER = 1.5  # times the depth, from where a surface is sampled too coarsely t
 def find_contradicted(surfaces: Surfaces) -> np.ndarray:
     """The points that other views see through, or most disagree with, bool [views, height, width].
 
-    Those that most disagree with count only with MIN_MAJORITY_VIEWS, and where points of the neighbours that are kept
-    cover their pixel.
+    Those that most disagree with count only with MIN_MAJORITY_VIEWS, and where their view has no need of them: where
+    points of the neighbours that are kept cover their pixel, or they hide the surfaces of MANY_HIDDEN views.
     """
-    s, shape = surfaces, surfaces.depth.shape
-    colors, least, most = s.color_ranges
-    support, against = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    kept = np.ones(shape, bool)
-
-    def count_support(view: int) -> None:
-        of_view = s.points[view], colors[view], s.neighbors[view]
-        _support(*of_view, s.depth, s.viewmats, s.Ks, least, most, support[view])
-
-    def count_against(view: int) -> None:
-        of_view = s.points[view], colors[view], s.neighbors[view]
-        _against(*of_view, s.depth, s.viewmats, s.Ks, least, most, solid, against[view])
-
-    with ThreadPoolExecutor(min(len(s.depth), thread_count())) as pool:
-        list(pool.map(count_support, range(len(s.depth))))
-        for _ in range(ROUNDS):
-            solid = kept & (support > 0)
-            list(pool.map(count_against, range(len(s.depth))))
-            np.less_equal(against, VOTE_RATIO * (support + MIN_SUPPORT), out=kept)
+    support = _support_of_all(surfaces)
+    kept = np.ones(support.shape, bool)
+    for _ in range(ROUNDS):
+        kept = _votes_against(surfaces, kept & (support > 0)) <= VOTE_RATIO * (support + MIN_SUPPORT)
+    s = surfaces
     if len(s.depth) < MIN_MAJORITY_VIEWS:
         return ~kept
     consistency = multi_view_consistency(s.points, s.depth, s.extrinsics, s.intrinsics, s.neighbors)
     agreed = kept & (consistency >= MIN_CONSISTENCY)
-    return ~kept | (~agreed & _covered(s, agreed))
+    hides_many = _votes_against(s, np.ones_like(kept)) >= MANY_HIDDEN
+    return ~kept | (~agreed & (hides_many | _covered(s, agreed)))
+
+
+def _support_of_all(surfaces: Surfaces) -> np.ndarray:
+    """How many neighbours agree with each point, float32 [views, height, width]."""
+    s, support = surfaces, np.zeros(surfaces.depth.shape, np.float32)
+    colors, least, most = s.color_ranges
+
+    def count(view: int) -> None:
+        of_view = s.points[view], colors[view], s.neighbors[view]
+        _support(*of_view, s.depth, s.viewmats, s.Ks, least, most, support[view])
+
+    _over_views(count, len(support))
+    return support
+
+
+def _votes_against(surfaces: Surfaces, solid: np.ndarray) -> np.ndarray:
+    """How many neighbours see a solid surface through each point, float32 [views, height, width].
+
+    solid: the points that vote, bool [views, height, width].
+    """
+    s, against = surfaces, np.zeros(surfaces.depth.shape, np.float32)
+    colors, least, most = s.color_ranges
+
+    def count(view: int) -> None:
+        of_view = s.points[view], colors[view], s.neighbors[view]
+        _against(*of_view, s.depth, s.viewmats, s.Ks, least, most, solid, against[view])
+
+    _over_views(count, len(against))
+    return against
+
+
+def _over_views(task: Callable[[int], None], views: int) -> None:
+    with ThreadPoolExecutor(min(views, thread_count())) as pool:
+        list(pool.map(task, range(views)))
 
 
 def find_redundant(surfaces: Surfaces, kept: np.ndarray) -> np.ndarray:
@@ -96,8 +119,7 @@ def _covered(surfaces: Surfaces, kept: np.ndarray) -> np.ndarray:
             _mark(s.points[neighbor], kept[neighbor], s.viewmats[view], s.Ks[view], covered[view])
         covered[view] = cv2.morphologyEx(covered[view], cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
 
-    with ThreadPoolExecutor(min(len(kept), thread_count())) as pool:
-        list(pool.map(cover, range(len(kept))))
+    _over_views(cover, len(kept))
     return covered > 0
 
 

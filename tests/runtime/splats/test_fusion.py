@@ -130,6 +130,17 @@ def test_a_point_that_most_views_disagree_with_stays_where_no_other_view_covers_
     assert not found[0].any()
 
 
+def test_a_point_that_hides_the_surfaces_of_many_views_goes_even_if_its_pixel_is_left_empty() -> None:
+    """As in the test before, with six others that see their wall behind the first one, and with five."""
+    for views, goes in ((7, True), (6, False)):
+        depth, extrinsics = wall(views) * np.linspace(0.5, 1.5, views)[:, None, None], cameras(views) * 1.0
+        extrinsics[:, 0, 3] *= 0.1  # near each other, so that all see the same
+        points = unproject(depth, extrinsics)
+        points[1:, ..., 2] *= -1
+        found = find_contradicted(Surfaces(points, depth, extrinsics, np.tile(K, (views, 1, 1))))
+        assert found[0, HEIGHT // 2, WIDTH // 2] == goes
+
+
 def test_a_nearer_view_of_a_surface_stays() -> None:
     """It samples the surface more finely than those that stand farther away."""
     extrinsics = cameras(3) * 1.0
