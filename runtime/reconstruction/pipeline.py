@@ -130,7 +130,7 @@ def reconstruct(
         del predictor  # its memory is needed for the refinement, unless the caller keeps it open
         seconds |= prediction.seconds
         fused = fuse(prediction, placed, span, plan.filters)
-        del prediction  # as above: what was fused is the smaller part
+        del prediction  # fusion keeps a third of many views: the rest would stay in memory during the refinement
         finished = refine_prediction(fused.prediction, placed, plan, on_step)
     return Reconstruction(
         finished.prediction,

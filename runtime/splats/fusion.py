@@ -9,14 +9,13 @@ Of what is left, few copies of each surface stay: those of the views in the midd
 """
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
 
 from ..geometry.consistency import multi_view_consistency
 from ..system.compilation import compiled
-from ..system.threads import thread_count
+from ..system.threads import map_in_threads
 from .surfaces import Surfaces, project_to_pixel
 
 DEPTH_TOLERANCE = 0.02  # relative difference in depth up to which two views agree
@@ -38,51 +37,32 @@ def find_contradicted(surfaces: Surfaces) -> np.ndarray:
     Those that most disagree with count only with MIN_MAJORITY_VIEWS, and where their view has no need of them: where
     points of the neighbours that are kept cover their pixel, or they hide the surfaces of MANY_HIDDEN views.
     """
-    support = _support_of_all(surfaces)
+    s, support = surfaces, _votes(surfaces, _support)
     kept = np.ones(support.shape, bool)
     for _ in range(ROUNDS):
-        kept = _votes_against(surfaces, kept & (support > 0)) <= VOTE_RATIO * (support + MIN_SUPPORT)
-    s = surfaces
+        kept = _votes(s, _against, kept & (support > 0)) <= VOTE_RATIO * (support + MIN_SUPPORT)
     if len(s.depth) < MIN_MAJORITY_VIEWS:
         return ~kept
     consistency = multi_view_consistency(s.points, s.depth, s.extrinsics, s.intrinsics, s.neighbors)
     agreed = kept & (consistency >= MIN_CONSISTENCY)
-    hides_many = _votes_against(s, np.ones_like(kept)) >= MANY_HIDDEN
+    hides_many = _votes(s, _against, np.ones_like(kept)) >= MANY_HIDDEN
     return ~kept | (~agreed & (hides_many | _covered(s, agreed)))
 
 
-def _support_of_all(surfaces: Surfaces) -> np.ndarray:
-    """How many neighbours agree with each point, float32 [views, height, width]."""
-    s, support = surfaces, np.zeros(surfaces.depth.shape, np.float32)
-    colors, least, most = s.color_ranges
+def _votes(surfaces: Surfaces, kernel: Callable[..., None], *voters: np.ndarray) -> np.ndarray:
+    """The neighbours' votes for or against each point, as `_support` or `_against` counts them, float32.
 
-    def count(view: int) -> None:
-        of_view = s.points[view], colors[view], s.neighbors[view]
-        _support(*of_view, s.depth, s.viewmats, s.Ks, least, most, support[view])
-
-    _over_views(count, len(support))
-    return support
-
-
-def _votes_against(surfaces: Surfaces, solid: np.ndarray) -> np.ndarray:
-    """How many neighbours see a solid surface through each point, float32 [views, height, width].
-
-    solid: the points that vote, bool [views, height, width].
+    [views, height, width]. voters: for `_against`, the points that are solid, bool of the same shape.
     """
-    s, against = surfaces, np.zeros(surfaces.depth.shape, np.float32)
+    s, votes = surfaces, np.zeros(surfaces.depth.shape, np.float32)
     colors, least, most = s.color_ranges
 
     def count(view: int) -> None:
         of_view = s.points[view], colors[view], s.neighbors[view]
-        _against(*of_view, s.depth, s.viewmats, s.Ks, least, most, solid, against[view])
+        kernel(*of_view, s.depth, s.viewmats, s.Ks, least, most, *voters, votes[view])
 
-    _over_views(count, len(against))
-    return against
-
-
-def _over_views(task: Callable[[int], None], views: int) -> None:
-    with ThreadPoolExecutor(min(views, thread_count())) as pool:
-        list(pool.map(task, range(views)))
+    map_in_threads(count, len(votes))
+    return votes
 
 
 def find_redundant(surfaces: Surfaces, kept: np.ndarray) -> np.ndarray:
@@ -119,7 +99,7 @@ def _covered(surfaces: Surfaces, kept: np.ndarray) -> np.ndarray:
             _mark(s.points[neighbor], kept[neighbor], s.viewmats[view], s.Ks[view], covered[view])
         covered[view] = cv2.morphologyEx(covered[view], cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
 
-    _over_views(cover, len(kept))
+    map_in_threads(cover, len(kept))
     return covered > 0
 
 

@@ -1,10 +1,8 @@
 """Closing of holes: shapes that follow the surface, background behind depth edges, and a backdrop behind all."""
 
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 
-from ..system.threads import thread_count
+from ..system.threads import map_in_threads
 from .backdrop import make_backdrop
 from .background import continue_background
 from .gaussians import Gaussians
@@ -19,8 +17,7 @@ def close_holes(gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarray) -> G
     width].
     """
     _ = surfaces.spacings  # computed once, and not by each thread
-    with ThreadPoolExecutor(min(len(kept), thread_count())) as pool:
-        parts = list(pool.map(lambda view: close_view(gaussians, surfaces, kept, view), range(len(kept))))
+    parts = map_in_threads(lambda view: close_view(gaussians, surfaces, kept, view), len(kept))
     return Gaussians.concatenate([part for each in zip(*parts, strict=True) for part in each])
 
 

@@ -1,6 +1,11 @@
 """How many threads our own computations take: one for each core, unless a process was given fewer."""
 
 import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+Result = TypeVar("Result")
 
 _LIMITS: list[int] = []
 
@@ -13,3 +18,9 @@ def limit_threads(count: int) -> None:
 def thread_count() -> int:
     """The number of threads to start."""
     return min(os.cpu_count() or 1, *_LIMITS) if _LIMITS else os.cpu_count() or 1
+
+
+def map_in_threads(task: Callable[[int], Result], count: int) -> list[Result]:
+    """What a task gives for the numbers from 0 to `count` - 1, in their order."""
+    with ThreadPoolExecutor(min(count, thread_count())) as pool:
+        return list(pool.map(task, range(count)))
