@@ -9,7 +9,10 @@ from ..cameras.camera import Camera
 from .selection import score_pairs
 
 # Up to so many views, each gets a group of its own, with its best partners. That takes up to three times as long.
-OWN_GROUPS = 8
+OWN_GROUPS = 24
+# Of a pair, beyond which a view makes the depth of a group of its own worse instead of better: a parallax of 25 degrees at
+# an overlap of 80 %, or of 10 degrees at 50 %.
+MAX_COST = 3.0
 NO_OVERLAP = 1e6  # more than the cost of any pair that sees something in common
 TINY = np.finfo(np.float64).tiny
 
@@ -25,9 +28,10 @@ class ViewGroup:
 def group_views(cameras: Sequence[Camera], depths: np.ndarray, size: int) -> list[ViewGroup]:
     """Groups of at most `size` views so that each view is used once, beside the views that suit it best.
 
-    Up to OWN_GROUPS views, each is grouped with its best partners, and equal groups are one. Of more views, a group
-    grows from a view that has none yet: by the views without a group that make the best pairs with its own, and then by
-    the best partner that each of these lacks. Where there is no room for that, the view waits for the next group.
+    Up to OWN_GROUPS views, each is grouped with its best partner and others up to MAX_COST, and equal groups are one.
+    Of more views, a group grows from a view that has none yet: by the views without a group that make the best pairs
+    with its own, and then by the best partner that each of these lacks. Where there is no room for that, the view waits
+    for the next group.
     size: 3 or more. depths: of the scene in each camera, [cameras].
     """
     count = len(cameras)
@@ -49,10 +53,11 @@ def group_views(cameras: Sequence[Camera], depths: np.ndarray, size: int) -> lis
 
 
 def _own_groups(cost: np.ndarray, size: int) -> list[ViewGroup]:
-    """The group of each view and the `size` - 1 others that make the best pairs with it; equal groups are one."""
+    """The group of each view and up to `size` - 1 others that make good pairs with it; equal groups are one."""
     used: dict[tuple[int, ...], list[int]] = {}
-    for view, others in enumerate(_best_partners(cost, size - 1)):
-        used.setdefault(tuple(sorted({view, *others.tolist()})), []).append(view)
+    for view, (best, *others) in enumerate(_best_partners(cost, size - 1).tolist()):
+        good = [other for other in others if cost[view, other] <= MAX_COST]
+        used.setdefault(tuple(sorted({view, best, *good})), []).append(view)
     return [ViewGroup(views, tuple(own)) for views, own in used.items()]
 
 

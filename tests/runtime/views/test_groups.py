@@ -40,7 +40,7 @@ def test_few_views_are_one_group() -> None:
 
 
 def test_each_of_eight_views_is_beside_its_two_best_partners() -> None:
-    """Along a path those are its neighbours, or at an end the next two; nine views share groups."""
+    """Along a path those are its neighbours, or at an end the next two; 25 views share groups."""
     positions = np.random.default_rng(0).permutation(np.arange(8) * 0.8)
     rank = np.argsort(np.argsort(positions))
     groups = groups_of(positions, 3)
@@ -48,7 +48,16 @@ def test_each_of_eight_views_is_beside_its_two_best_partners() -> None:
         for view in group.used:
             middle = min(max(rank[view], 1), 6)
             assert {rank[other] for other in group.views} == {middle - 1, middle, middle + 1}
-    assert len(groups) == 6 and len(groups_of(np.arange(9) * 0.8, 3)) < 9
+    assert len(groups) == 6 and len(groups_of(np.arange(24) * 0.8, 3)) == 22
+    assert len(groups_of(np.arange(25) * 0.8, 3)) < 20
+
+
+def test_a_view_far_aside_is_in_no_group_but_its_own() -> None:
+    """Depth is worse beside a view that sees little of the same; its own group is a pair, since none is predicted alone."""
+    groups = groups_of(np.array([0.0, 0.8, 1.6, 2.4, 9.0]), 3)
+    aside = [group for group in groups if 4 in group.views]
+    assert [(group.views, group.used) for group in aside] == [((3, 4), (4,))]
+    assert all(len(group.views) == 3 for group in groups if group not in aside)
 
 
 @pytest.mark.parametrize("size", [4, 6])
