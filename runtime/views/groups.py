@@ -10,8 +10,8 @@ from .selection import score_pairs
 
 # Up to so many views, each gets a group of its own, with its best partners. That takes up to three times as long.
 OWN_GROUPS = 24
-# Of a pair, beyond which a view makes the depth of a group of its own worse instead of better: a parallax of 25 degrees at
-# an overlap of 80 %, or of 10 degrees at 50 %.
+# Of a pair, beyond which a view makes the depth of a group of its own worse instead of better: a parallax of 25 degrees
+# at an overlap of 80 %, or of 10 degrees at 50 %.
 MAX_COST = 3.0
 NO_OVERLAP = 1e6  # more than the cost of any pair that sees something in common
 TINY = np.finfo(np.float64).tiny

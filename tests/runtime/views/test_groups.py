@@ -53,7 +53,7 @@ def test_each_of_eight_views_is_beside_its_two_best_partners() -> None:
 
 
 def test_a_view_far_aside_is_in_no_group_but_its_own() -> None:
-    """Depth is worse beside a view that sees little of the same; its own group is a pair, since none is predicted alone."""
+    """Depth is worse beside a view that sees little of the same. Its own group is a pair: none is predicted alone."""
     groups = groups_of(np.array([0.0, 0.8, 1.6, 2.4, 9.0]), 3)
     aside = [group for group in groups if 4 in group.views]
     assert [(group.views, group.used) for group in aside] == [((3, 4), (4,))]
