@@ -78,7 +78,10 @@ weights: setup runs/textures
 	$(BIN)/idesplat train --out runs/head --train head --init runs/lite/last.ckpt --preset idesplat-lite \
 		--textures runs/textures --scenes 2000 --steps 5000 --batch 2 --processes 2 --precision bf16 --lr 3e-4 \
 		--size 256 --seed 1
-	$(BIN)/python -P -m idesplat.tools.training.release runs/head/last.ckpt --preset idesplat-lite
+	$(BIN)/idesplat train --out runs/all --init runs/head/last.ckpt --preset idesplat-lite --no-curriculum \
+		--textures runs/textures --steps 560 --batch 2 --processes 2 --precision bf16 --lr 3e-4 \
+		--perceptual lite0 --consistency 0.01 --size 256 --seed 33
+	$(BIN)/python -P -m idesplat.tools.training.release runs/all/last.ckpt
 
 clean:
 	rm -rf $(VENV) build site .typing tests/npm/node_modules docs/examples/node_modules runtime/web/vendor *.egg-info
