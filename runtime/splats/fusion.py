@@ -28,7 +28,6 @@ MANY_HIDDEN = 6  # views whose surfaces a point hides, from where it does more h
 MIN_MAJORITY_VIEWS = 4  # from which on most views can outvote one; of three, two that disagree may both be wrong
 MIN_VOTING_VIEWS = 3  # with two views, a contradiction does not tell which of both is wrong
 COPIES = 2  # views whose points of one surface are kept
-COPY_TOLERANCE = 0.05  # relative difference in depth up to which points of two views are copies of one surface
 COARSER = 1.5  # times the depth, from where a surface is sampled too coarsely to stand for another copy
 
 
@@ -194,6 +193,6 @@ def _thin(
                 z, y, x = project_to_pixel(points[row, column], viewmats[view], Ks[view], height, width)
                 if y < 0 or not left[view, y, x] or z > COARSER * depth[own, row, column]:
                     continue
-                copies += abs(z - depth[view, y, x]) <= COPY_TOLERANCE * depth[view, y, x]
+                copies += abs(z - depth[view, y, x]) <= DEPTH_TOLERANCE * depth[view, y, x]
             if copies >= COPIES:
                 left[own, row, column] = False

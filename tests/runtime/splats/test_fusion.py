@@ -102,15 +102,6 @@ def test_the_two_views_in_the_middle_stay_and_of_the_others_what_these_do_not_se
     assert not redundant[0, :, : shift - 1].any() and not redundant[3, :, WIDTH - shift + 1 :].any()
 
 
-@pytest.mark.parametrize(("difference", "copy"), [(0.0, True), (0.04, True), (-0.04, True), (0.07, False)])
-def test_depths_that_nearly_agree_are_copies_of_one_surface(difference: float, copy: bool) -> None:
-    """Views that disagree by some per cent show one surface all the same; two layers of it blur."""
-    depth = wall(3)
-    depth[2] *= 1 + difference
-    redundant = find_redundant(surfaces(depth), np.ones(depth.shape, bool))
-    assert not redundant[:2].any() and redundant[2].any() == copy
-
-
 def test_what_is_removed_counts_as_no_copy() -> None:
     kept = np.ones((4, HEIGHT, WIDTH), bool)
     kept[1] = False
