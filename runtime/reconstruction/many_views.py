@@ -9,9 +9,11 @@ from ..errors import InputError
 from ..inference.predictor import Prediction, Predictor
 from ..splats.gaussians import Gaussians
 from ..system.progress import progress
+from ..system.threads import map_in_threads
 from ..views.batch import ViewBatch
 from ..views.depth_range import BASELINE, DepthRange
 from ..views.groups import group_views, nearest_views
+from .agreement import Agreement
 
 # Pixels of all views that the network gets together: about 2 GB of memory with the bundled model.
 GROUP_PIXELS = 600_000
@@ -24,8 +26,9 @@ VOTERS = 24
 def predict_views(
     predictor: Predictor, views: ViewBatch, span: DepthRange, near: float | None = None, far: float | None = None
 ) -> Prediction:
-    """Depth and Gaussians of all views, each predicted once, beside the views that suit it best.
+    """Depth and Gaussians of all views, each predicted beside the views that suit it best.
 
+    Where groups overlap, a view is predicted several times: of these, each pixel is the one that most views agree with.
     span: the depth range of all views. near, far: where they are given; else each group has its own depth range, which
     is narrower, so that more depth candidates lie where its surfaces are.
     """
@@ -34,7 +37,7 @@ def predict_views(
     groups = group_views(views.cameras, _middle_depths(views, span), size)
     if len(groups) == 1:
         return predictor.predict_views(views, span.near, span.far)
-    parts: dict[int, Prediction] = {}
+    parts: list[list[Prediction]] = [[] for _ in views.names]  # of each view, that of its own group first
     seconds: dict[str, float] = {}
     for group in progress(groups, "predicting groups of views"):
         members = _subset(views, group.views)
@@ -42,8 +45,9 @@ def predict_views(
         prediction = predictor.predict_views(members, own.near, own.far)
         for name, value in prediction.seconds.items():
             seconds[name] = seconds.get(name, 0) + value
-        parts |= {view: _of_view(prediction, group.views.index(view)) for view in group.used}
-    ordered = [parts[view] for view in range(len(views.names))]
+        for place, view in enumerate(group.views):
+            parts[view].insert(0 if view in group.used else len(parts[view]), _of_view(prediction, place))
+    ordered = _choose(parts, views, span)
     gaussians = [part.gaussians for part in ordered if part.gaussians is not None]
     return Prediction(
         np.concatenate([part.depth for part in ordered]),
@@ -51,6 +55,17 @@ def predict_views(
         seconds,
         [part.cameras[0] for part in ordered],
     )
+
+
+def _choose(parts: list[list[Prediction]], views: ViewBatch, span: DepthRange) -> list[Prediction]:
+    """One prediction of each view; `parts` is emptied, so that no more than needed stays in memory."""
+    agreement = Agreement(np.concatenate([own.depth for own, *_ in parts]), views, voting_views(views, span))
+
+    def choose(view: int) -> Prediction:
+        predictions, parts[view] = parts[view], []
+        return agreement.best(view, predictions)
+
+    return map_in_threads(choose, len(parts))
 
 
 def _own_range(

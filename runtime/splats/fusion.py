@@ -16,7 +16,7 @@ import numpy as np
 from ..geometry.consistency import multi_view_consistency
 from ..system.compilation import compiled
 from ..system.threads import map_in_threads
-from .surfaces import Surfaces, project_to_pixel
+from .surfaces import Surfaces, color_agrees, project_to_pixel
 
 DEPTH_TOLERANCE = 0.02  # relative difference in depth up to which two views agree
 ROUNDS = 3  # a point that is removed no longer contradicts others
@@ -116,13 +116,6 @@ def _mark(points: np.ndarray, kept: np.ndarray, viewmat: np.ndarray, K: np.ndarr
 
 
 @compiled()
-def _agrees(color: np.ndarray, least: np.ndarray, most: np.ndarray) -> bool:
-    """Whether a colour [3] is within a range."""
-    red = least[0] <= color[0] <= most[0]
-    return red and least[1] <= color[1] <= most[1] and least[2] <= color[2] <= most[2]
-
-
-@compiled()
 def _support(
     points: np.ndarray,  # [height, width, 3]
     colors: np.ndarray,  # [height, width, 3]
@@ -142,7 +135,7 @@ def _support(
             for view in neighbors:
                 z, y, x = project_to_pixel(points[row, column], viewmats[view], Ks[view], height, width)
                 if y >= 0 and abs(z - depth[view, y, x]) <= DEPTH_TOLERANCE * depth[view, y, x]:
-                    count += _agrees(colors[row, column], least[view, y, x], most[view, y, x])
+                    count += color_agrees(colors[row, column], least[view, y, x], most[view, y, x])
             support[row, column] = count
 
 
@@ -169,7 +162,7 @@ def _against(
                 if y < 0 or not solid[view, y, x] or z >= depth[view, y, x] * (1 + DEPTH_TOLERANCE):
                     continue
                 before = z < depth[view, y, x] * (1 - DEPTH_TOLERANCE)
-                if before or not _agrees(colors[row, column], least[view, y, x], most[view, y, x]):
+                if before or not color_agrees(colors[row, column], least[view, y, x], most[view, y, x]):
                     votes += 1
             against[row, column] = votes
 

@@ -118,3 +118,10 @@ def project_to_pixel(
     if not (0 <= column < width and 0 <= row < height):
         return depth, -1, 0
     return depth, int(row), int(column)
+
+
+@compiled()
+def color_agrees(color: np.ndarray, least: np.ndarray, most: np.ndarray) -> bool:
+    """Whether a colour [3] is within a range."""
+    red = least[0] <= color[0] <= most[0]
+    return red and least[1] <= color[1] <= most[1] and least[2] <= color[2] <= most[2]

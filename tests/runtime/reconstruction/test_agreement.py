@@ -1,0 +1,97 @@
+"""The choice among several predictions of a view, on a plane that five cameras see."""
+
+import numpy as np
+from idesplat.runtime.cameras.camera import Camera
+from idesplat.runtime.inference.predictor import Prediction
+from idesplat.runtime.reconstruction.agreement import WINDOW, Agreement
+from idesplat.runtime.splats.gaussians import Gaussians
+from idesplat.runtime.views.batch import ViewBatch
+
+VIEWS, HEIGHT, WIDTH = 5, 32, 48
+PLANE = 10.0
+WRONG = 6.0
+K = np.array([[WIDTH, 0, WIDTH / 2], [0, WIDTH, HEIGHT / 2], [0, 0, 1]])
+
+
+def plane_views(colors: np.ndarray | None = None) -> ViewBatch:
+    """Cameras beside each other before the plane, of one colour each, [views, 3]; gray by default."""
+    extrinsics = np.tile(np.eye(4), (VIEWS, 1, 1))
+    extrinsics[:, 0, 3] = 0.3 * np.arange(VIEWS)
+    names = [f"{view}.png" for view in range(VIEWS)]
+    cameras = [Camera(name, WIDTH, HEIGHT, K, pose) for name, pose in zip(names, extrinsics, strict=True)]
+    gray = np.full((VIEWS, 3), 0.5, np.float32)
+    images = np.ones((VIEWS, 3, HEIGHT, WIDTH), np.float32) * (gray if colors is None else colors)[..., None, None]
+    intrinsics = np.tile(np.float32([[1, 0, 0.5], [0, WIDTH / HEIGHT, 0.5], [0, 0, 1]]), (VIEWS, 1, 1))
+    return ViewBatch(names, images, extrinsics, intrinsics, cameras)
+
+
+def agreement(views: ViewBatch, neighbors: list[list[int]] | None = None) -> Agreement:
+    """All views see the plane; each is asked about the others unless neighbors are given."""
+    others = neighbors or [[other for other in range(VIEWS) if other != view] for view in range(VIEWS)]
+    depth = np.full((VIEWS, HEIGHT, WIDTH), PLANE, np.float32)
+    return Agreement(depth, views, [np.array(each, np.int64) for each in others])
+
+
+def predicted(depth: np.ndarray, gaussians: bool = True) -> Prediction:
+    """A prediction of one view whose Gaussians have their depth as opacity, a tenth of it."""
+    flat = depth.ravel().astype(np.float32)
+    values = Gaussians(
+        np.repeat(flat[:, None], 3, 1),
+        np.ones((flat.size, 3), np.float32),
+        np.ones((flat.size, 4), np.float32),
+        flat / 10,
+        np.zeros((flat.size, 1, 3), np.float32),
+    )
+    return Prediction(depth[None].astype(np.float32), values if gaussians else None)
+
+
+def halves(left: float, right: float) -> np.ndarray:
+    """A depth map with one depth on each side."""
+    depth = np.full((HEIGHT, WIDTH), left)
+    depth[:, WIDTH // 2 :] = right
+    return depth
+
+
+def test_each_pixel_is_of_the_prediction_that_the_other_views_agree_with() -> None:
+    choice = agreement(plane_views())
+    best = choice.best(2, [predicted(halves(PLANE, WRONG)), predicted(halves(WRONG, PLANE)), predicted(halves(4, 5))])
+    edge = WIDTH // 2
+    inner = np.abs(np.arange(WIDTH) - edge) > WINDOW
+    assert best.depth.shape == (1, HEIGHT, WIDTH)
+    np.testing.assert_array_equal(best.depth[0][:, inner], PLANE)
+    np.testing.assert_array_equal(best.need_gaussians().opacities, best.depth.ravel() / 10)
+
+
+def test_equal_predictions_leave_that_of_the_own_group() -> None:
+    own, other = predicted(halves(PLANE, PLANE)), predicted(halves(PLANE + 0.1, PLANE + 0.1))
+    best = agreement(plane_views()).best(0, [own, other])
+    np.testing.assert_array_equal(best.depth, own.depth)
+
+
+def test_without_views_that_vote_the_own_group_decides() -> None:
+    own, other = predicted(halves(WRONG, WRONG)), predicted(halves(PLANE, PLANE))
+    best = agreement(plane_views(), [[] for _ in range(VIEWS)]).best(0, [own, other])
+    np.testing.assert_array_equal(best.depth, own.depth)
+
+
+def test_agreement_in_depth_does_not_count_where_colours_differ() -> None:
+    colors = np.full((VIEWS, 3), 0.1, np.float32)
+    colors[2] = 0.9
+    own, other = predicted(halves(WRONG, WRONG)), predicted(halves(PLANE, PLANE))
+    np.testing.assert_array_equal(agreement(plane_views(colors)).best(2, [own, other]).depth, own.depth)
+    np.testing.assert_array_equal(agreement(plane_views()).best(2, [own, other]).depth, other.depth)
+
+
+def test_what_the_others_do_not_see_is_no_better_than_the_own_depth() -> None:
+    """A depth behind the others' surfaces has no votes, one that half of the voters agree with has more support."""
+    hidden = predicted(halves(2 * PLANE, 2 * PLANE))
+    right = predicted(halves(PLANE, PLANE))
+    np.testing.assert_array_equal(agreement(plane_views()).best(2, [right, hidden]).depth, right.depth)
+    np.testing.assert_array_equal(agreement(plane_views()).best(2, [hidden, right]).depth, right.depth)
+
+
+def test_models_of_depth_alone_have_a_choice_too() -> None:
+    own, other = predicted(halves(WRONG, WRONG), gaussians=False), predicted(halves(PLANE, PLANE), gaussians=False)
+    best = agreement(plane_views()).best(1, [own, other])
+    np.testing.assert_array_equal(best.depth, other.depth)
+    assert best.gaussians is None
