@@ -33,7 +33,7 @@ class Agreement:
 
     def __init__(self, depth: np.ndarray, views: ViewBatch, neighbors: list[np.ndarray]) -> None:
         self.views = views
-        points = unproject(depth, views.extrinsics, views.intrinsics)
+        points = np.stack([self._points(view, surface) for view, surface in enumerate(depth)])
         self.surfaces = Surfaces(points, depth, views.extrinsics, views.intrinsics, views.images, neighbors)
         self.nearest = np.stack([cv2.erode(surface, SQUARE) for surface in self.surfaces.depth])
         self.farthest = np.stack([cv2.dilate(surface, SQUARE) for surface in self.surfaces.depth])
@@ -53,13 +53,16 @@ class Agreement:
     def _score(self, view: int, depth: np.ndarray) -> np.ndarray:
         """The share of the votes for each pixel's depth, float32 [height, width]."""
         s = self.surfaces
-        pose, intrinsics = self.views.extrinsics[view : view + 1], self.views.intrinsics[view : view + 1]
-        points = unproject(depth[None], pose, intrinsics)[0].astype(np.float32)
         colors, least, most = s.color_ranges
         score = np.empty(depth.shape, np.float32)
-        cameras = s.viewmats, s.Ks
-        _vote(points, colors[view], s.neighbors[view], self.nearest, self.farthest, *cameras, least, most, score)
+        of_view = self._points(view, depth), colors[view], s.neighbors[view]
+        _vote(*of_view, self.nearest, self.farthest, s.viewmats, s.Ks, least, most, score)
         return score
+
+    def _points(self, view: int, depth: np.ndarray) -> np.ndarray:
+        """The points of a view's depth map [height, width], float32 [height, width, 3]: one view's, to save memory."""
+        one = slice(view, view + 1)
+        return unproject(depth[None], self.views.extrinsics[one], self.views.intrinsics[one])[0].astype(np.float32)
 
 
 def _merge(predictions: Sequence[Prediction], chosen: np.ndarray) -> Prediction:
