@@ -1,6 +1,6 @@
 """Prediction for any number of views, in groups as large as the network was trained with, and as fit the memory."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +12,7 @@ from ..system.progress import progress
 from ..system.threads import map_in_threads
 from ..views.batch import ViewBatch
 from ..views.depth_range import BASELINE, DepthRange
-from ..views.groups import group_views, nearest_views
+from ..views.groups import ViewGroup, group_views, nearest_views
 from .agreement import Agreement
 
 # Pixels of all views that the network gets together: about 2 GB of memory with the bundled model.
@@ -21,6 +21,9 @@ MIN_GROUP = 3  # views
 # Views that vote on a view's points. Half of them see most of the same; the others look from other sides, where a wrong
 # depth shows that neighbours agree on because nothing in their images speaks against it.
 VOTERS = 24
+# Pixels of the predictions that are kept beside those of the views' own groups: about 2.5 GB. Of 200 photographs at the
+# default size each has one, of fewer than 50 all that there are.
+OTHER_PIXELS = 16_000_000
 
 
 def predict_views(
@@ -37,16 +40,9 @@ def predict_views(
     groups = group_views(views.cameras, _middle_depths(views, span), size)
     if len(groups) == 1:
         return predictor.predict_views(views, span.near, span.far)
-    parts: list[list[Prediction]] = [[] for _ in views.names]  # of each view, that of its own group first
-    seconds: dict[str, float] = {}
-    for group in progress(groups, "predicting groups of views"):
-        members = _subset(views, group.views)
-        own = _own_range(predictor, members, span, near, far)
-        prediction = predictor.predict_views(members, own.near, own.far)
-        for name, value in prediction.seconds.items():
-            seconds[name] = seconds.get(name, 0) + value
-        for place, view in enumerate(group.views):
-            parts[view].insert(0 if view in group.used else len(parts[view]), _of_view(prediction, place))
+    parts, seconds = _predict_groups(
+        predictor, views, groups, lambda members: _own_range(predictor, members, span, near, far)
+    )
     ordered = _choose(parts, views, span)
     gaussians = [part.gaussians for part in ordered if part.gaussians is not None]
     return Prediction(
@@ -55,6 +51,28 @@ def predict_views(
         seconds,
         [part.cameras[0] for part in ordered],
     )
+
+
+def _predict_groups(
+    predictor: Predictor, views: ViewBatch, groups: Sequence[ViewGroup], depth_range: Callable[[ViewBatch], DepthRange]
+) -> tuple[list[list[Prediction]], dict[str, float]]:
+    """All predictions that are kept of each view, that of its own group first, and the seconds that they took."""
+    own: dict[int, Prediction] = {}
+    others: list[list[Prediction]] = [[] for _ in views.names]
+    most_others = OTHER_PIXELS // views.images[:, 0].size
+    seconds: dict[str, float] = {}
+    for group in progress(groups, "predicting groups of views"):
+        members = _subset(views, group.views)
+        span = depth_range(members)
+        prediction = predictor.predict_views(members, span.near, span.far)
+        for name, value in prediction.seconds.items():
+            seconds[name] = seconds.get(name, 0) + value
+        for place, view in enumerate(group.views):
+            if view in group.used:
+                own[view] = _of_view(prediction, place)
+            elif len(others[view]) < most_others:
+                others[view].append(_of_view(prediction, place))
+    return [[own[view], *rest] for view, rest in enumerate(others)], seconds
 
 
 def _choose(parts: list[list[Prediction]], views: ViewBatch, span: DepthRange) -> list[Prediction]:
