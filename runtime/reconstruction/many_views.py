@@ -1,6 +1,6 @@
 """Prediction for any number of views, in groups as large as the network was trained with, and as fit the memory."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,8 +21,8 @@ MIN_GROUP = 3  # views
 # Views that vote on a view's points. Half of them see most of the same; the others look from other sides, where a wrong
 # depth shows that neighbours agree on because nothing in their images speaks against it.
 VOTERS = 24
-# Pixels of the predictions that are kept beside those of the views' own groups: about 2.5 GB. Of 200 photographs at the
-# default size each has one, of fewer than 50 all that there are.
+# Pixels of the predictions that are kept beside those of the views' own groups: about 1.5 GB with the bundled model. Of
+# 200 photographs at its default size each has at most one, of 50 four.
 OTHER_PIXELS = 16_000_000
 
 
@@ -40,9 +40,7 @@ def predict_views(
     groups = group_views(views.cameras, _middle_depths(views, span), size)
     if len(groups) == 1:
         return predictor.predict_views(views, span.near, span.far)
-    parts, seconds = _predict_groups(
-        predictor, views, groups, lambda members: _own_range(predictor, members, span, near, far)
-    )
+    parts, seconds = _predict_groups(predictor, views, groups, span, near, far)
     ordered = _choose(parts, views, span)
     gaussians = [part.gaussians for part in ordered if part.gaussians is not None]
     return Prediction(
@@ -54,7 +52,12 @@ def predict_views(
 
 
 def _predict_groups(
-    predictor: Predictor, views: ViewBatch, groups: Sequence[ViewGroup], depth_range: Callable[[ViewBatch], DepthRange]
+    predictor: Predictor,
+    views: ViewBatch,
+    groups: Sequence[ViewGroup],
+    span: DepthRange,
+    near: float | None,
+    far: float | None,
 ) -> tuple[list[list[Prediction]], dict[str, float]]:
     """All predictions that are kept of each view, that of its own group first, and the seconds that they took."""
     own: dict[int, Prediction] = {}
@@ -63,8 +66,8 @@ def _predict_groups(
     seconds: dict[str, float] = {}
     for group in progress(groups, "predicting groups of views"):
         members = _subset(views, group.views)
-        span = depth_range(members)
-        prediction = predictor.predict_views(members, span.near, span.far)
+        depths = _own_range(predictor, members, span, near, far)
+        prediction = predictor.predict_views(members, depths.near, depths.far)
         for name, value in prediction.seconds.items():
             seconds[name] = seconds.get(name, 0) + value
         for place, view in enumerate(group.views):

@@ -132,7 +132,10 @@ def test_a_view_that_its_own_group_has_wrong_is_taken_from_another_group() -> No
     np.testing.assert_array_equal(prediction.depth, 10.0)
 
 
-def test_no_more_predictions_are_kept_than_fit_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("other_views", "most"), [(18, 3), (9, 2), (8, 1)])
+def test_no_more_predictions_are_kept_than_fit_the_memory(
+    other_views: int, most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     views = batch(9)
     views.images[:] = 0.5
     chosen_from: list[int] = []
@@ -143,9 +146,7 @@ def test_no_more_predictions_are_kept_than_fit_the_memory(monkeypatch: pytest.Mo
         return best(agreement, view, predictions)
 
     monkeypatch.setattr(many_views.Agreement, "best", counting_best)
-    for other_views, most in (18, 3), (9, 2), (8, 1):
-        chosen_from.clear()
-        monkeypatch.setattr(many_views, "OTHER_PIXELS", other_views * HEIGHT * WIDTH)
-        prediction = many_views.predict_views(NumberingPredictor(True, trained_views=3), views, SPAN)
-        np.testing.assert_array_equal(prediction.depth, 0.5)
-        assert len(chosen_from) == 9 and max(chosen_from) == most
+    monkeypatch.setattr(many_views, "OTHER_PIXELS", other_views * HEIGHT * WIDTH)
+    prediction = many_views.predict_views(NumberingPredictor(True, trained_views=3), views, SPAN)
+    np.testing.assert_array_equal(prediction.depth, 0.5)
+    assert len(chosen_from) == 9 and max(chosen_from) == most
