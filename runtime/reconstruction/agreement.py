@@ -45,12 +45,12 @@ class Agreement:
         """
         if len(predictions) == 1:
             return predictions[0]
-        scores = [self._score(view, prediction.depth[0]) for prediction in predictions]
+        scores = [self.score(view, prediction.depth[0]) for prediction in predictions]
         means = np.stack([cv2.blur(score, (WINDOW, WINDOW)) for score in scores])
         means[0] += OWN_MARGIN
         return _merge(predictions, means.argmax(axis=0))
 
-    def _score(self, view: int, depth: np.ndarray) -> np.ndarray:
+    def score(self, view: int, depth: np.ndarray) -> np.ndarray:
         """The share of the votes for each pixel's depth, float32 [height, width]."""
         s = self.surfaces
         colors, least, most = s.color_ranges

@@ -129,7 +129,7 @@ def reconstruct(
         LOG.info("predicted in %s", ", ".join(f"{name} {value:.2f} s" for name, value in prediction.seconds.items()))
         del predictor  # its memory is needed for the refinement, unless the caller keeps it open
         seconds |= prediction.seconds
-        fused = fuse(prediction, placed, span, plan.filters)
+        fused = fuse(prediction, placed, span, plan)
         del prediction  # fusion keeps a third of many views: the rest would stay in memory during the refinement
         finished = refine_prediction(fused.prediction, placed, plan, on_step)
     return Reconstruction(

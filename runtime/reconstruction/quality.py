@@ -35,8 +35,8 @@ class Preset:
     """A trade of time for quality.
 
     views: how many images are used where neither --views nor --select says it. pixels: least area of the images that
-    the network gets; that of its training if larger. fuse: whether Gaussians that other views see through and surplus
-    copies of a surface are removed, and holes closed.
+    the network gets; that of its training if larger. fuse: whether depths are corrected by the other views,
+    Gaussians that these see through and surplus copies of a surface are removed, and holes closed.
     steps_per_added_view, seconds: of the refinement, whichever ends first; no steps for none. Steps count for each
     image beyond the first: two images are soon overfitted, more are not. The seconds are those of `views` images, and
     grow with their number beyond. copy_side: longer side of the images that it fits, in pixels.

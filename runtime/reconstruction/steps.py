@@ -17,6 +17,7 @@ from ..views.batch import ViewBatch
 from ..views.depth_range import DepthRange
 from .many_views import voting_views
 from .quality import PRESETS, Preset, Quality, RefinementLimit, default_quality, parse_refine
+from .stereo import correct_depths
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,11 @@ class Plan:
         """The longer side of the images to refine on; 0 where there is nothing to do."""
         steps = self.limit.steps if self.limit else self.preset.steps_per_added_view
         return self.preset.copy_side if self.gaussians and (steps or self.max_gaussians) else 0
+
+    @property
+    def corrects_depths(self) -> bool:
+        """Whether the views' depths are corrected by stereo matching between them."""
+        return self.preset.fuse and self.gaussians
 
     def refinement(self, views: int) -> RefinementOptions:
         """The options of the refinement on so many views."""
@@ -73,18 +79,21 @@ def make_plan(
     return Plan(preset, filters, limit, max_gaussians, model.metadata.gaussians)
 
 
-def fuse(prediction: Prediction, views: ViewBatch, span: DepthRange, filters: FilterOptions) -> Stepped:
-    """The prediction with the Gaussians that the filters keep."""
-    if not filters.enabled:
+def fuse(prediction: Prediction, views: ViewBatch, span: DepthRange, plan: Plan) -> Stepped:
+    """The prediction with its depths corrected, if the plan fuses views, and the Gaussians that its filters keep."""
+    if not (plan.corrects_depths or plan.filters.enabled):
         return Stepped(prediction)
     started = time.perf_counter()
+    voters = voting_views(views, span)
+    if plan.corrects_depths:
+        prediction = correct_depths(prediction, views, voters)
     kept, removed = filter_gaussians(
         prediction.need_gaussians(),
         prediction.depth,
         views.extrinsics,
         views.intrinsics,
-        filters,
-        voting_views(views, span),
+        plan.filters,
+        voters,
         views.images,
     )
     notes = [describe_removed(removed, len(kept))] if any(removed.values()) else []

@@ -111,7 +111,7 @@ class CaptureEvaluator:
         with reporting_to(None):
             views, _ = compensate_exposure(views, ExposureMode.AUTO)
             prediction = predict_views(self.predictor, views, span)
-            prediction = fuse(prediction, views, span, self.plan.filters).prediction
+            prediction = fuse(prediction, views, span, self.plan).prediction
             if self.plan.copy_side:
                 prediction = refine_prediction(prediction, views, self.plan, None).prediction
         return prediction.need_gaussians(), time.perf_counter() - started

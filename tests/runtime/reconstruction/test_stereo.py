@@ -1,0 +1,109 @@
+"""Depth corrected by stereo matching, on textured and plain planes that cameras beside each other see."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from idesplat.runtime.cameras.camera import Camera
+from idesplat.runtime.inference.predictor import Prediction
+from idesplat.runtime.reconstruction.stereo import MIN_VIEWS, correct_depths
+from idesplat.runtime.splats.gaussians import Gaussians
+from idesplat.runtime.splats.points import unproject
+from idesplat.runtime.views.batch import ViewBatch
+
+VIEWS, HEIGHT, WIDTH = 5, 48, 128
+PLANE, FOCAL, BASELINE = 4.0, 80.0, 0.5  # neighbours see the plane 10 pixels apart
+K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+INTRINSICS = K / [[WIDTH], [HEIGHT], [1]]
+INNER = (slice(6, -6), slice(44, -44))  # pixels that all views see, without those whose patch crosses the frame
+
+
+def plane_views(count: int = VIEWS, textured: bool = True) -> ViewBatch:
+    """Cameras beside each other before a plane of blurred noise, or of one colour."""
+    shift = round(FOCAL * BASELINE / PLANE)
+    noise = np.random.default_rng(0).random((HEIGHT, WIDTH + shift * count)).astype(np.float32)
+    wall = cv2.GaussianBlur(noise, (0, 0), 1.5) if textured else np.full_like(noise, 0.5)
+    images = np.stack([wall[:, shift * view : shift * view + WIDTH] for view in range(count)])
+    extrinsics = np.tile(np.eye(4), (count, 1, 1))
+    extrinsics[:, 0, 3] = BASELINE * np.arange(count)
+    names = [f"{view}.png" for view in range(count)]
+    cameras = [Camera(name, WIDTH, HEIGHT, K, pose) for name, pose in zip(names, extrinsics, strict=True)]
+    return ViewBatch(
+        names,
+        np.repeat(images[:, None], 3, 1),
+        extrinsics,
+        np.tile(INTRINSICS.astype(np.float32), (count, 1, 1)),
+        cameras,
+    )
+
+
+def predicted(depth: np.ndarray, views: ViewBatch) -> Prediction:
+    """A prediction whose Gaussians lie at the depth, [views, height, width], one unit large."""
+    means = unproject(depth, views.extrinsics, views.intrinsics).reshape(-1, 3).astype(np.float32)
+    ones = np.ones(len(means), np.float32)
+    gaussians = Gaussians(
+        means, np.ones((len(means), 3), np.float32), np.ones((len(means), 4), np.float32), ones, means[:, None] * 0
+    )
+    return Prediction(depth.astype(np.float32), gaussians)
+
+
+def corrected(depth: np.ndarray, views: ViewBatch) -> Prediction:
+    """All views are asked about each."""
+    count = len(views.names)
+    voters = [
+        np.array(sorted(set(range(count)) - {view}, key=lambda other: abs(other - view))) for view in range(count)
+    ]
+    return correct_depths(predicted(depth, views), views, voters)
+
+
+def plane_depth(count: int = VIEWS) -> np.ndarray:
+    return np.full((count, HEIGHT, WIDTH), PLANE, np.float32)
+
+
+@pytest.mark.parametrize("factor", [0.8, 0.9, 1.15, 1.3])
+def test_a_depth_that_the_images_speak_against_moves_to_where_they_match(factor: float) -> None:
+    depth = plane_depth()
+    depth[2] *= factor
+    done = corrected(depth, plane_views())
+    error = np.abs(done.depth[2] - PLANE)[INNER] / PLANE
+    assert np.median(error) < 0.002
+    assert (error < abs(factor - 1) / 2).mean() > 0.95
+
+
+def test_right_depths_stay_exactly() -> None:
+    done = corrected(plane_depth(), plane_views())
+    np.testing.assert_array_equal(done.depth[(slice(None), *INNER)], PLANE)
+
+
+def test_a_plain_surface_stays_where_no_view_contradicts() -> None:
+    depth = plane_depth()
+    depth[2] *= 1.01
+    done = corrected(depth, plane_views(textured=False))
+    np.testing.assert_array_equal(done.depth, depth)
+
+
+def test_gaussians_move_along_their_rays_and_keep_their_size_in_the_image() -> None:
+    depth, views = plane_depth(), plane_views()
+    depth[2] *= 1.1
+    done = corrected(depth, views)
+    expected = predicted(done.depth, views).need_gaussians()
+    gaussians = done.need_gaussians()
+    np.testing.assert_allclose(gaussians.means, expected.means, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(gaussians.scales[:, 0], (done.depth / depth).ravel(), rtol=1e-6)
+
+
+def test_fewer_views_than_can_outvote_one_stay_as_predicted() -> None:
+    count = MIN_VIEWS - 1
+    depth = plane_depth(count)
+    depth[1] *= 1.01
+    np.testing.assert_array_equal(corrected(depth, plane_views(count)).depth, depth)
+
+
+def test_views_that_see_nothing_of_the_same_stay_as_predicted() -> None:
+    views = plane_views()
+    apart = views.extrinsics.copy()
+    apart[:, 0, 3] *= 1000
+    depth = plane_depth()
+    depth[2] *= 1.01
+    np.testing.assert_array_equal(corrected(depth, replace(views, extrinsics=apart)).depth, depth)
