@@ -61,7 +61,7 @@ class Preset:
 PRESETS = {
     Quality.FAST: Preset(views=2, pixels=0, fuse=False, steps_per_added_view=0, seconds=inf, copy_side=COPY_SIDE),
     Quality.STANDARD: Preset(views=8, pixels=0, fuse=True, steps_per_added_view=40, seconds=36, copy_side=COPY_SIDE),
-    Quality.HIGH: Preset(views=24, pixels=1 << 17, fuse=True, steps_per_added_view=60, seconds=180, copy_side=640),
+    Quality.HIGH: Preset(views=24, pixels=1 << 17, fuse=True, steps_per_added_view=60, seconds=160, copy_side=640),
 }
 
 
