@@ -11,13 +11,12 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from ..geometry.intrinsics import denormalize_intrinsics
 from ..inference.predictor import Prediction
-from ..splats.surfaces import project_to_pixel
+from ..splats.surfaces import Surfaces, project_to_pixel
 from ..system.compilation import compiled
 from ..system.threads import map_in_threads
 from ..views.batch import ViewBatch
-from .agreement import Agreement
+from .agreement import SQUARE, Agreement
 
 MIN_VIEWS = 4  # fewer cannot outvote a wrong match
 SOURCES = 4  # neighbours whose images and surfaces are compared
@@ -26,7 +25,6 @@ WINDOW = 5  # pixels a side of a patch, and of the pixels that choose together
 NOISE = 1e-3  # variance of a patch, of colours in [0, 1], at which ZNCC counts half: plain surfaces match everywhere
 OWN_MARGIN = 0.1  # by which a candidate must be better than the depth as predicted
 OUTSIDE = np.nan  # ZNCC of a patch that a view does not see
-SQUARE = np.ones((3, 3), np.uint8)
 
 
 def correct_depths(prediction: Prediction, views: ViewBatch, voters: list[np.ndarray]) -> Prediction:
@@ -37,7 +35,8 @@ def correct_depths(prediction: Prediction, views: ViewBatch, voters: list[np.nda
     """
     if len(views.names) < MIN_VIEWS:
         return prediction
-    agreement, matcher = Agreement(prediction.depth, views, voters), Matcher(views)
+    agreement = Agreement(prediction.depth, views, voters)
+    matcher = Matcher(views.images, agreement.surfaces)
 
     def rate(view: int, depth: np.ndarray) -> np.ndarray:
         matches = matcher.score(view, depth, voters[view][:SOURCES])
@@ -55,17 +54,18 @@ def correct_depths(prediction: Prediction, views: ViewBatch, voters: list[np.nda
 
 
 class Matcher:
-    """The views' images in grey, with the mean and variance of every patch, and their cameras."""
+    """The views' images in grey, with the mean and variance of every patch.
 
-    def __init__(self, views: ViewBatch) -> None:
-        height, width = views.images.shape[2:]
-        self.images = [np.ascontiguousarray(image.mean(axis=0), np.float32) for image in views.images]
+    images: RGB in [0, 1], [views, 3, height, width]. surfaces: have the views' cameras.
+    """
+
+    def __init__(self, images: np.ndarray, surfaces: Surfaces) -> None:
+        self.surfaces = surfaces
+        self.images = [np.ascontiguousarray(image.mean(axis=0), np.float32) for image in images]
         self.means = [_mean(image) for image in self.images]
         self.variances = [
             _mean(np.square(image)) - np.square(mean) for image, mean in zip(self.images, self.means, strict=True)
         ]
-        self.extrinsics = views.extrinsics.astype(np.float64)
-        self.Ks = denormalize_intrinsics(views.intrinsics, width, height).astype(np.float64)
 
     def score(self, view: int, depth: np.ndarray, sources: np.ndarray) -> np.ndarray:
         """The mean ZNCC with the better half of the sources that see a pixel, 0 without any, float32 [height, width].
@@ -79,10 +79,11 @@ class Matcher:
 
     def _zncc(self, view: int, depth: np.ndarray, source: int) -> np.ndarray:
         """ZNCC of a view's patches with those of another image at their depth, OUTSIDE it or -1 to 1."""
-        to_source = np.linalg.inv(self.extrinsics[source]) @ self.extrinsics[view]
-        from_pixels = self.Ks[source] @ to_source[:3, :3] @ np.linalg.inv(self.Ks[view])
+        s = self.surfaces
+        to_source = s.viewmats[source] @ s.extrinsics[view]
+        from_pixels = s.Ks[source] @ to_source[:3, :3] @ np.linalg.inv(s.Ks[view])
         image, seen = np.empty_like(depth), np.empty(depth.shape, np.bool_)
-        _sample(depth, from_pixels, self.Ks[source] @ to_source[:3, 3], self.images[source], image, seen)
+        _sample(depth, from_pixels, s.Ks[source] @ to_source[:3, 3], self.images[source], image, seen)
         mean = _mean(image)
         variance = np.maximum(_mean(np.square(image)) - np.square(mean), 0)
         covariance = _mean(self.images[view] * image) - mean * self.means[view]
