@@ -12,6 +12,7 @@ from ..inference.bundled_model import bundled_model
 STEPS_OR_SECONDS = re.compile(r"([0-9]{1,6})(s?)")
 MAX_STEPS = 100_000
 COPY_SIDE = 384
+SECONDS_PER_FURTHER_VIEW = 8
 
 
 class Quality(StrEnum):
@@ -38,8 +39,8 @@ class Preset:
     the network gets; that of its training if larger. fuse: whether depths are corrected by the other views,
     Gaussians that these see through and surplus copies of a surface are removed, and holes closed.
     steps_per_added_view, seconds: of the refinement, whichever ends first; no steps for none. Steps count for each
-    image beyond the first: two images are soon overfitted, more are not. The seconds are those of `views` images, and
-    grow with their number beyond. copy_side: longer side of the images that it fits, in pixels.
+    image beyond the first: two images are soon overfitted, more are not. The seconds are those of `views` images; each
+    further one adds SECONDS_PER_FURTHER_VIEW. copy_side: longer side of the images that it fits, in pixels.
     """
 
     views: int
@@ -55,7 +56,7 @@ class Preset:
 
     def limit(self, views: int) -> RefinementLimit:
         """When the refinement on so many images ends."""
-        return RefinementLimit(self.steps(views), self.seconds * max(1, views / self.views))
+        return RefinementLimit(self.steps(views), self.seconds + SECONDS_PER_FURTHER_VIEW * max(0, views - self.views))
 
 
 PRESETS = {

@@ -13,6 +13,9 @@ from ..refinement.options import RefinementOptions, prediction_options
 from ..refinement.refine import refine
 from ..refinement.views import posed_image
 from ..splats.filtering import FilterOptions, describe_removed, filter_gaussians
+from ..splats.free_space import find_in_free_space
+from ..splats.fusion import MIN_VOTING_VIEWS
+from ..splats.gaussians import Gaussians
 from ..views.batch import ViewBatch
 from ..views.depth_range import DepthRange
 from .many_views import voting_views
@@ -43,6 +46,10 @@ class Plan:
     def corrects_depths(self) -> bool:
         """Whether the views' depths are corrected by stereo matching between them."""
         return self.preset.fuse and self.gaussians
+
+    def clears_free_space(self, views: ViewBatch) -> bool:
+        """Whether Gaussians right before the cameras are removed."""
+        return self.corrects_depths and len(views.names) >= MIN_VOTING_VIEWS
 
     def refinement(self, views: int) -> RefinementOptions:
         """The options of the refinement on so many views."""
@@ -96,6 +103,9 @@ def fuse(prediction: Prediction, views: ViewBatch, span: DepthRange, plan: Plan)
         voters,
         views.images,
     )
+    if plan.clears_free_space(views):
+        cleared = _without_free_space(kept, prediction, views)
+        kept, removed = cleared, removed | {"free_space": len(kept) - len(cleared)}
     notes = [describe_removed(removed, len(kept))] if any(removed.values()) else []
     return Stepped(replace(prediction, gaussians=kept), removed, {"fuse": time.perf_counter() - started}, notes)
 
@@ -109,6 +119,9 @@ def refine_prediction(
     started = time.perf_counter()
     images = [posed_image(copy, pose) for copy, pose in zip(views.copies, views.extrinsics, strict=True)]
     refined = refine(prediction.need_gaussians(), images, plan.refinement(len(images)), on_step)
+    gaussians = refined.gaussians
+    if plan.clears_free_space(views):
+        gaussians = _without_free_space(gaussians, prediction, views)  # refinement moves some there
     seconds = time.perf_counter() - started
     notes = []
     if refined.steps:
@@ -116,4 +129,10 @@ def refine_prediction(
         notes.append(
             f"refined in {refined.steps} steps, {seconds:.0f} s: PSNR of the input views {first:.1f} to {last:.1f} dB"
         )
-    return Stepped(replace(prediction, gaussians=refined.gaussians), {}, {"refine": seconds}, notes, refined.psnr)
+    return Stepped(replace(prediction, gaussians=gaussians), {}, {"refine": seconds}, notes, refined.psnr)
+
+
+def _without_free_space(gaussians: Gaussians, prediction: Prediction, views: ViewBatch) -> Gaussians:
+    """The Gaussians that do not hang right before the cameras; all, where views contradict each other throughout."""
+    found = find_in_free_space(gaussians.means, prediction.depth, views.extrinsics, views.intrinsics)
+    return gaussians if found.all() else gaussians.select(~found)

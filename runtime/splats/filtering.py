@@ -124,6 +124,7 @@ def describe_removed(removed: dict[str, int], left: int) -> str:
         "remove_contradicted": "that other views see through",
         "merge_duplicates": "merged into another view's",
         "remove_redundant": "that two other views show as well",
+        "free_space": "right before the cameras",
     }
     counts = ", ".join(f"{count:,} {words[name]}" for name, count in removed.items())
     return f"filtered: {counts}; {left:,} Gaussians left"

@@ -6,7 +6,14 @@ from types import SimpleNamespace
 import pytest
 from idesplat import InputError
 from idesplat.runtime.inference.bundled_model import bundled_model
-from idesplat.runtime.reconstruction.quality import MAX_STEPS, PRESETS, Quality, RefinementLimit, parse_refine
+from idesplat.runtime.reconstruction.quality import (
+    MAX_STEPS,
+    PRESETS,
+    SECONDS_PER_FURTHER_VIEW,
+    Quality,
+    RefinementLimit,
+    parse_refine,
+)
 from idesplat.runtime.reconstruction.steps import make_plan
 from idesplat.runtime.splats.filtering import FilterOptions
 
@@ -52,7 +59,9 @@ def test_refine_overrides_the_quality() -> None:
 def test_more_images_than_the_quality_takes_have_more_time() -> None:
     standard = PRESETS[Quality.STANDARD]
     assert plan("standard").refinement(2).seconds == plan("standard").refinement(standard.views).seconds
-    assert plan("standard").refinement(5 * standard.views).seconds == 5 * standard.seconds
+    further = 12
+    more = plan("standard").refinement(standard.views + further).seconds
+    assert more == standard.seconds + further * SECONDS_PER_FURTHER_VIEW
 
 
 def test_a_limit_on_the_gaussians_alone_changes_none_of_those_that_stay() -> None:
