@@ -47,10 +47,6 @@ class Plan:
         """Whether the views' depths are corrected by stereo matching between them."""
         return self.preset.fuse and self.gaussians
 
-    def clears_free_space(self, views: ViewBatch) -> bool:
-        """Whether Gaussians right before the cameras are removed."""
-        return self.corrects_depths and len(views.names) >= MIN_VOTING_VIEWS
-
     def refinement(self, views: int) -> RefinementOptions:
         """The options of the refinement on so many views."""
         limit = self.limit or self.preset.limit(views)
@@ -103,8 +99,8 @@ def fuse(prediction: Prediction, views: ViewBatch, span: DepthRange, plan: Plan)
         voters,
         views.images,
     )
-    if plan.clears_free_space(views):
-        cleared = _without_free_space(kept, prediction, views)
+    cleared = _clear_free_space(kept, prediction, views, plan)
+    if cleared is not kept:
         kept, removed = cleared, removed | {"free_space": len(kept) - len(cleared)}
     notes = [describe_removed(removed, len(kept))] if any(removed.values()) else []
     return Stepped(replace(prediction, gaussians=kept), removed, {"fuse": time.perf_counter() - started}, notes)
@@ -119,9 +115,7 @@ def refine_prediction(
     started = time.perf_counter()
     images = [posed_image(copy, pose) for copy, pose in zip(views.copies, views.extrinsics, strict=True)]
     refined = refine(prediction.need_gaussians(), images, plan.refinement(len(images)), on_step)
-    gaussians = refined.gaussians
-    if plan.clears_free_space(views):
-        gaussians = _without_free_space(gaussians, prediction, views)  # refinement moves some there
+    gaussians = _clear_free_space(refined.gaussians, prediction, views, plan)  # refinement moves some there
     seconds = time.perf_counter() - started
     notes = []
     if refined.steps:
@@ -132,7 +126,9 @@ def refine_prediction(
     return Stepped(replace(prediction, gaussians=gaussians), {}, {"refine": seconds}, notes, refined.psnr)
 
 
-def _without_free_space(gaussians: Gaussians, prediction: Prediction, views: ViewBatch) -> Gaussians:
-    """The Gaussians that do not hang right before the cameras; all, where views contradict each other throughout."""
+def _clear_free_space(gaussians: Gaussians, prediction: Prediction, views: ViewBatch, plan: Plan) -> Gaussians:
+    """Those that do not hang right before the cameras, if the plan fuses views; all, if that would leave none."""
+    if not plan.corrects_depths or len(views.names) < MIN_VOTING_VIEWS:
+        return gaussians
     found = find_in_free_space(gaussians.means, prediction.depth, views.extrinsics, views.intrinsics)
     return gaussians if found.all() else gaussians.select(~found)

@@ -13,6 +13,7 @@ from ..geometry.rigid import invert_rigid
 from ..geometry.trajectories import interpolate_extrinsics
 from ..system.compilation import compiled
 from ..system.threads import map_in_threads
+from .surfaces import project_to_pixel
 
 NEIGHBORS = 4  # cameras that each one is joined with
 FRAMES = 5  # cameras from one to another, both included
@@ -20,6 +21,7 @@ NEAREST = 0.01  # share of a view's pixels that may be nearer than its nearest s
 FREE = 0.5  # of the nearest surface's depth, up to where there is nothing
 REACH = 1.5  # times this depth, up to where views are joined: between them, one is nearer than the surface
 MARGIN = 0.1  # of the image's sides, by which a camera between two may see more than they do
+SIDE = 1 + 2 * MARGIN  # of an enlarged image
 BLOCK = 1 << 14  # Gaussians of one task
 
 
@@ -38,6 +40,7 @@ def find_in_free_space(
     cameras = list(_cameras(depth, extrinsics.astype(np.float64)))
     viewmats = np.stack([invert_rigid(pose) for _, pose, _ in cameras])
     Ks = denormalize_intrinsics(intrinsics[[view for view, _, _ in cameras]].astype(np.float64), 1, 1)
+    Ks[:, :2, 2] += MARGIN  # of an image with sides of 1, enlarged on all sides
     limits = np.array([limit for _, _, limit in cameras])
     found = np.zeros(len(means), np.bool_)
 
@@ -70,20 +73,14 @@ def _cameras(depth: np.ndarray, extrinsics: np.ndarray) -> Iterator[tuple[int, n
 def _find(
     means: np.ndarray,  # [gaussians, 3]
     viewmats: np.ndarray,  # [cameras, 4, 4]
-    Ks: np.ndarray,  # [cameras, 3, 3], of images with sides of 1
+    Ks: np.ndarray,  # [cameras, 3, 3], of images with sides of SIDE
     limits: np.ndarray,  # [cameras]: depth that is free
     found: np.ndarray,  # [gaussians]
 ) -> None:
     """Find the means that a camera sees nearer than its limit."""
     for index in range(len(means)):
-        x, y, z = np.float64(means[index, 0]), np.float64(means[index, 1]), np.float64(means[index, 2])
         for camera in range(len(viewmats)):
-            m, K = viewmats[camera], Ks[camera]
-            away = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-            if not 0 < away < limits[camera]:
-                continue
-            across = K[0, 0] * (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / away + K[0, 2]
-            down = K[1, 1] * (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / away + K[1, 2]
-            if -MARGIN < across < 1 + MARGIN and -MARGIN < down < 1 + MARGIN:
+            away, row, _ = project_to_pixel(means[index], viewmats[camera], Ks[camera], SIDE, SIDE)
+            if row >= 0 and away < limits[camera]:
                 found[index] = True
                 break
