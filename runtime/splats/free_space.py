@@ -21,7 +21,8 @@ NEAREST = 0.01  # share of a view's pixels that may be nearer than its nearest s
 FREE = 0.5  # of the nearest surface's depth, up to where there is nothing
 REACH = 1.5  # times this depth, up to where views are joined: between them, one is nearer than the surface
 MARGIN = 0.1  # of the image's sides, by which a camera between two may see more than they do
-SIDE = 1 + 2 * MARGIN  # of an enlarged image
+SIDE = 100  # pixels of an image, for its bounds alone
+ENLARGED = round(SIDE * (1 + 2 * MARGIN))
 BLOCK = 1 << 14  # Gaussians of one task
 
 
@@ -39,8 +40,8 @@ def find_in_free_space(
     """
     cameras = list(_cameras(depth, extrinsics.astype(np.float64)))
     viewmats = np.stack([invert_rigid(pose) for _, pose, _ in cameras])
-    Ks = denormalize_intrinsics(intrinsics[[view for view, _, _ in cameras]].astype(np.float64), 1, 1)
-    Ks[:, :2, 2] += MARGIN  # of an image with sides of 1, enlarged on all sides
+    Ks = denormalize_intrinsics(intrinsics[[view for view, _, _ in cameras]].astype(np.float64), SIDE, SIDE)
+    Ks[:, :2, 2] += MARGIN * SIDE
     limits = np.array([limit for _, _, limit in cameras])
     found = np.zeros(len(means), np.bool_)
 
@@ -73,14 +74,14 @@ def _cameras(depth: np.ndarray, extrinsics: np.ndarray) -> Iterator[tuple[int, n
 def _find(
     means: np.ndarray,  # [gaussians, 3]
     viewmats: np.ndarray,  # [cameras, 4, 4]
-    Ks: np.ndarray,  # [cameras, 3, 3], of images with sides of SIDE
+    Ks: np.ndarray,  # [cameras, 3, 3], of images with ENLARGED pixels a side
     limits: np.ndarray,  # [cameras]: depth that is free
     found: np.ndarray,  # [gaussians]
 ) -> None:
     """Find the means that a camera sees nearer than its limit."""
     for index in range(len(means)):
         for camera in range(len(viewmats)):
-            away, row, _ = project_to_pixel(means[index], viewmats[camera], Ks[camera], SIDE, SIDE)
+            away, row, _ = project_to_pixel(means[index], viewmats[camera], Ks[camera], ENLARGED, ENLARGED)
             if row >= 0 and away < limits[camera]:
                 found[index] = True
                 break
