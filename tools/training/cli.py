@@ -14,7 +14,7 @@ from ...runtime.cli.terminal import run, say, warn
 from ...runtime.errors import InputError
 from ...runtime.images.sizes import parse_size
 from ...runtime.system.outputs import outputs
-from .options import Objective, Part, PerceptualKind, Precision
+from .options import Device, Objective, Part, PerceptualKind, Precision
 from .run_files import CHECKPOINT, CURVES, LOG, PREDICTIONS
 
 SECONDS_PER_MINUTE = 60
@@ -65,6 +65,9 @@ def train(
     ] = "256x256",
     lr: Annotated[float, typer.Option(help="Highest learning rate.", min=0)] = 1e-3,
     vit_lr: Annotated[float, typer.Option(help="Highest learning rate of the ViT.", min=0)] = 5e-4,
+    photo_lr: Annotated[
+        float, typer.Option(help="Highest learning rate of EfficientNet-Lite0; 0 leaves its ImageNet weights.", min=0)
+    ] = 0.0,
     seed: Annotated[int, typer.Option(help="Random seed of weights and scenes.", min=0)] = 0,
     perceptual: Annotated[
         PerceptualKind,
@@ -95,6 +98,9 @@ def train(
         int,
         typer.Option(help="PyTorch threads per process. Generating scenes takes part of another.", min=1),
     ] = 1,
+    device: Annotated[
+        Device, typer.Option(help="Where the network is trained. The CPU renders scenes and Gaussians in any case.")
+    ] = Device.CPU,
     save_every: Annotated[float, typer.Option(help="Minutes between checkpoints.", min=0)] = 3.0,
     validate_every: Annotated[int, typer.Option(help="Steps between validations.", min=1)] = 200,
     overwrite: Overwrite = False,
@@ -128,6 +134,7 @@ def train(
         pointmaps=str(pointmaps.resolve()) if pointmaps else "",
         consistency=consistency,
         aperture=aperture,
+        photo_lr=photo_lr,
     )
     config = network_config(settings)
     _announce(out, init, data or [])
@@ -151,6 +158,7 @@ def train(
             features=features,
             processes=processes,
             threads=threads,
+            device=device.value,
             save_every=save_every * SECONDS_PER_MINUTE,
             validate_every=validate_every,
             on_start=warn_without_lpips,

@@ -1,4 +1,4 @@
-"""bfloat16 training on a CPU: some modules compute under autocast.
+"""bfloat16 training: some modules compute under autocast.
 
 Geometry, softmax over candidates, gather attention, the Gaussians and all losses stay in float32. Inputs and outputs of
 a wrapped module are converted.
@@ -27,8 +27,8 @@ BF16_MODULES = (
 )
 # Methods that `forward` does not call.
 BF16_METHODS = {DPTHead: ("features",)}
-# Modules inside those whose gradients take three to five times as long in bfloat16: depthwise convolutions of maps in
-# channels-last order.
+# Modules inside those whose gradients take three to five times as long in bfloat16 on a CPU: depthwise convolutions of
+# maps in channels-last order.
 FLOAT32_MODULES = (DepthwiseConv,)
 
 
@@ -51,7 +51,7 @@ def _run_in_bf16(module: nn.Module, name: str) -> None:
 
     @wraps(method)
     def in_bf16(*arguments: Any) -> Any:
-        with torch.autocast("cpu", dtype=torch.bfloat16):
+        with torch.autocast(next(module.parameters()).device.type, dtype=torch.bfloat16):
             found = method(*arguments)
         return _to_float32(found)
 
@@ -63,7 +63,7 @@ def _run_in_float32(module: nn.Module) -> None:
 
     @wraps(method)
     def in_float32(tokens: Tensor, *arguments: Any) -> Tensor:
-        with torch.autocast("cpu", enabled=False):
+        with torch.autocast(tokens.device.type, enabled=False):
             return method(tokens.float(), *arguments)
 
     module.forward = in_float32

@@ -34,6 +34,13 @@ class Precision(StrEnum):
     BF16 = "bf16"
 
 
+class Device(StrEnum):
+    """Where the network is trained; scenes are rendered and Gaussians composited on the CPU in any case."""
+
+    CPU = "cpu"
+    CUDA = "cuda"
+
+
 @dataclass(frozen=True)
 class OptionalTerms:
     """Terms of the loss that are left out where their value is 0.

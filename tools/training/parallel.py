@@ -47,12 +47,12 @@ class ProcessGroup:
         trained = [p for p in parameters if p.requires_grad]
         found = torch.tensor([float(p.grad is not None) for p in trained])
         parts = [torch.zeros_like(p).flatten() if p.grad is None else p.grad.flatten() for p in trained]
-        flat = torch.cat([found, *parts])
+        flat = torch.cat([found, torch.cat(parts).cpu()])  # gloo exchanges what is in the memory of the CPU
         with _peer_errors():
             dist.all_reduce(flat)
         found, *parts = flat.split([len(trained), *(p.numel() for p in trained)])
         for p, count, part in zip(trained, found.tolist(), parts, strict=True):
-            p.grad = part.view_as(p) if count else None
+            p.grad = part.view_as(p).to(p.device) if count else None
 
     def gather(self, entries: list[dict[str, float]]) -> list[dict[str, float]]:
         """The entries of all processes, in the order of ranks; raises InputError if one of them has ended."""

@@ -43,9 +43,9 @@ def load_lpips_network() -> Any:
     return lpips.LPIPS(net="vgg", verbose=False).requires_grad_(False)
 
 
-def load_lpips() -> Perceptual:
-    """The mean LPIPS of images; raises InputError as `check_lpips`."""
-    network = load_lpips_network()
+def load_lpips(device: str = "cpu") -> Perceptual:
+    """The mean LPIPS of images on a device; raises InputError as `check_lpips`."""
+    network = load_lpips_network().to(device)
     return lambda rendered, truth: network(rendered, truth, normalize=True).mean()
 
 
@@ -55,11 +55,12 @@ class EfficientNetDistance:
     d(a, b) = mean over levels and pixels of |f(a) / |f(a)| - f(b) / |f(b)||^2, with feature vectors f of a pixel.
     """
 
-    def __init__(self) -> None:
-        """Load the network; raises InputError if the package with its weights is not installed."""
+    def __init__(self, device: str = "cpu") -> None:
+        """Load the network for images on a device; raises InputError if the package of its weights is missing."""
         self.network = EfficientNetLite0().requires_grad_(False)
         load_imagenet_weights(self.network)
         del self.network.blocks[OUT_INDICES[LEVELS - 1] + 1 :]
+        self.network.to(device)
 
     def __call__(self, rendered: Tensor, truth: Tensor) -> Tensor:
         """Images [n, 3, H, W] in [0, 1], sides multiples of 8 pixels -> their mean distance, a scalar."""

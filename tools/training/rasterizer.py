@@ -1,9 +1,9 @@
-"""A differentiable rasteriser of Gaussians for training on a CPU, with gsplat's semantics and gradients for all inputs.
+"""A differentiable rasteriser of Gaussians for training, with gsplat's semantics and gradients for all inputs.
 
 Projection (`geometry.projection`) and spherical harmonics (`geometry.sh`) are in PyTorch, compositing
-(`rendering.types`) is compiled with numba: splats are visited front to back, and each is composited over the pixels of
-its bounding box. The backward pass visits them back to front. Nothing is stored per fragment: with T the transmittance
-behind a splat, that before it is T / (1 - alpha).
+(`rendering.types`) is compiled with numba for the CPU, also where the tensors are on a GPU: splats are visited front to
+back, and each is composited over the pixels of its bounding box. The backward pass visits them back to front. Nothing
+is stored per fragment: with T the transmittance behind a splat, that before it is T / (1 - alpha).
 """
 
 from collections.abc import Sequence
@@ -44,7 +44,7 @@ def rasterize(
     means: world units, [gaussians, 3]. quats: wxyz, of any length but zero, [gaussians, 4]. scales: world units,
     [gaussians, 3]. opacities: in [0, 1], [gaussians]. sh: degree 0 to 3, [gaussians, (degree + 1)^2, 3].
     viewmat: world-to-camera, OpenCV axes, [4, 4]. K: pixels, pixel centres at .5, [3, 3]. background: [3].
-    depth: sum of z-depth with the weights of colour, not divided by alpha. All tensors have one float type, on the CPU.
+    depth: sum of z-depth with the weights of colour, not divided by alpha. All tensors have one float type and device.
     aperture: diameter of a thin lens in world units, 0 for a pinhole. focus: z-depth of its plane in focus.
     """
     camera_means = means @ viewmat[:3, :3].T + viewmat[:3, 3]
@@ -74,8 +74,9 @@ def render_on_black(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """As `rasterize`, of Gaussians (means, scales, quats, opacities, sh) as the network orders them."""
     means, scales, quats, opacities, sh = gaussians
+    black = torch.zeros(3, device=means.device)
     return rasterize(
-        means, quats, scales, opacities, sh, viewmat, K, width, height, torch.zeros(3), aperture=aperture, focus=focus
+        means, quats, scales, opacities, sh, viewmat, K, width, height, black, aperture=aperture, focus=focus
     )
 
 
@@ -150,25 +151,26 @@ class _Composite(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         """centres [splats, 2], conics [splats, 3], opacities [splats], values [splats, 4]: colour and z-depth."""
         parts = (centres, conics, opacities, values)
-        xy, q, o, v = (np.ascontiguousarray(part.detach().numpy()) for part in parts)
+        xy, q, o, v = (np.ascontiguousarray(part.detach().cpu().numpy()) for part in parts)
         order = np.argsort(v[:, 3], kind="stable")
         image = np.zeros((height, width, 4), v.dtype)
         transmittance = np.ones((height, width), v.dtype)
         last = np.full((height, width), -1)
         _composite(xy, q, o, v, order, image, transmittance, last)
         ctx.parts = (xy, q, o, v, order, transmittance, last)
-        return torch.from_numpy(image), torch.from_numpy(transmittance)
+        return torch.from_numpy(image).to(centres.device), torch.from_numpy(transmittance).to(centres.device)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         """Gradients for centres, conics, opacities and values."""
-        for_image, for_transmittance = (np.ascontiguousarray(part.numpy()) for part in gradients)
+        for_image, for_transmittance = (np.ascontiguousarray(part.cpu().numpy()) for part in gradients)
         xy, q, o, v, order, transmittance, last = ctx.parts
         for_xy, for_q, for_o, for_v = np.zeros_like(xy), np.zeros_like(q), np.zeros_like(o), np.zeros_like(v)
         _composite_backward(
             xy, q, o, v, order, transmittance, last, for_image, for_transmittance, for_xy, for_q, for_o, for_v
         )
-        return *(torch.from_numpy(part) for part in (for_xy, for_q, for_o, for_v)), None, None
+        found = (for_xy, for_q, for_o, for_v)
+        return *(torch.from_numpy(part).to(gradients[0].device) for part in found), None, None
 
 
 @_compiled

@@ -18,8 +18,9 @@ class TrainingSettings:
 
     preset: an IDESplat preset. objective, part, precision, perceptual: values of the enums in `options`.
     curriculum: whether depth is trained from coarse to fine before the Gaussians. steps: of the whole run.
-    batch: scenes of a step. size: side of the images in the last phase, in pixels. lr, vit_lr: highest learning rates.
-    seed: of weights and scenes. init: a checkpoint to start from, or empty. data: folders of captures.
+    batch: scenes of a step. size: side of the images in the last phase, in pixels. lr, vit_lr, photo_lr: highest
+    learning rates; a photo_lr of 0 leaves EfficientNet-Lite0 frozen. seed: of weights and scenes.
+    init: a checkpoint to start from, or empty. data: folders of captures.
     scenes: number of different scenes if the head alone is trained, otherwise 0. real_ratio: share of the scenes that
     are captures. textures: folder of images for the textures of synthetic scenes, or empty. pm_loss, consistency,
     aperture: as of `OptionalTerms`. pointmaps: folder of the captures' pointmaps, or empty.
@@ -46,6 +47,7 @@ class TrainingSettings:
     pointmaps: str = ""
     consistency: float = 0.0
     aperture: float = 0.0
+    photo_lr: float = 0.0
 
     @property
     def terms(self) -> OptionalTerms:

@@ -15,7 +15,7 @@ from ...model.idesplat.keys import rename_released
 from ...model.idesplat.network import IDESplat
 from ...runtime.errors import InputError
 from ...runtime.system.files import atomic_write, check_regular
-from .gather_attention import use_compiled_gather_attention
+from .gather_attention import use_training_gather_attention
 from .initialization import new_model
 from .settings import TrainingSettings
 
@@ -24,10 +24,9 @@ EMA_DECAY = 0.99
 EMA_START = 10
 WEIGHT_DECAY = 0.01
 MAX_GRADIENT_NORM = 1.0
-# The ViT's parameters have a learning rate of their own.
+# The ViT's parameters and those with ImageNet weights have learning rates of their own.
 VIT_PREFIX = "encoder.vit."
-# The branch with ImageNet weights, which stay frozen.
-FROZEN_PREFIX = "encoder.photo.network."
+PHOTO_NETWORK_PREFIX = "encoder.photo.network."
 # Settings that checkpoints of earlier versions have under another name.
 RENAMED_SETTINGS = {"gradual": "curriculum"}
 # Settings that checkpoints of earlier versions may lack, with what those versions did.
@@ -43,24 +42,33 @@ class TrainingState:
     """The network in training. step: the number of steps done."""
 
     def __init__(
-        self, config: IDESplatConfig, seed: int, lr: float, vit_lr: float, trained: tuple[str, ...] = ("",)
+        self,
+        config: IDESplatConfig,
+        seed: int,
+        lr: float,
+        vit_lr: float,
+        photo_lr: float = 0.0,
+        trained: tuple[str, ...] = ("",),
+        device: str = "cpu",
     ) -> None:
-        """A new network, with random weights of `seed`. lr, vit_lr: highest learning rates.
+        """A new network, with random weights of `seed`.
 
-        trained: prefixes of the names of the trained parameters; the others are frozen.
+        lr, vit_lr, photo_lr: highest learning rates, of EfficientNet-Lite0 the last; 0 leaves it frozen.
+        trained: prefixes of the names of the trained parameters; the others are frozen. device: where it is trained.
         """
-        self.model = use_compiled_gather_attention(new_model(config, seed))
+        self.device = torch.device(device)
+        self.model = use_training_gather_attention(new_model(config, seed)).to(self.device)
         self.ema = {name: value.clone() for name, value in self.model.state_dict().items()}
         self.step = 0
+        rates = {VIT_PREFIX: vit_lr, PHOTO_NETWORK_PREFIX: photo_lr, "": lr}
+        groups: dict[str, dict[str, Any]] = {prefix: {"params": [], "highest": rate} for prefix, rate in rates.items()}
         for name, parameter in self.model.named_parameters():
-            parameter.requires_grad_(name.startswith(trained) and not name.startswith(FROZEN_PREFIX))
-        parameters = [(name, p) for name, p in self.model.named_parameters() if p.requires_grad]
-        groups = [
-            {"params": [p for name, p in parameters if not name.startswith(VIT_PREFIX)], "highest": lr},
-            {"params": [p for name, p in parameters if name.startswith(VIT_PREFIX)], "highest": vit_lr},
-        ]
-        groups = [group for group in groups if group["params"]]
-        self.optimizer = torch.optim.AdamW(groups, lr=lr, weight_decay=WEIGHT_DECAY, fused=True)
+            prefix = next(prefix for prefix in rates if name.startswith(prefix))
+            parameter.requires_grad_(name.startswith(trained) and rates[prefix] > 0)
+            if parameter.requires_grad:
+                groups[prefix]["params"].append(parameter)
+        used = [group for group in groups.values() if group["params"]]
+        self.optimizer = torch.optim.AdamW(used, lr=lr, weight_decay=WEIGHT_DECAY, fused=True)
 
     def start_from(self, path: Path) -> None:
         """Load the weights of a checkpoint, released or own; raises InputError if it does not fit the network."""
@@ -93,9 +101,9 @@ class TrainingState:
 
     def ema_model(self) -> IDESplat:
         """The network with the EMA of the weights, which predicts better than the last weights."""
-        model = use_compiled_gather_attention(IDESplat(self.model.config).eval())
+        model = use_training_gather_attention(IDESplat(self.model.config).eval())
         model.load_state_dict(self.ema)
-        return model
+        return model.to(self.device)
 
     def save(self, path: Path, settings: dict[str, Any]) -> None:
         """Write a checkpoint: the EMA as `state_dict`, which the exporter reads, and under `training` the rest."""
@@ -109,13 +117,13 @@ class TrainingState:
             },
         }
         with atomic_write(path) as temporary:
-            torch.save(content, temporary)
+            torch.save(_on_cpu(content), temporary)
 
     def resume(self, path: Path, settings: dict[str, Any]) -> None:
         """Resume from a checkpoint of the same run; raises InputError if it is of another run, or no checkpoint."""
         check_regular(path)
         try:
-            content = torch.load(path, weights_only=True)
+            content = torch.load(path, map_location="cpu", weights_only=True)
             training: dict[str, Any] = content["training"]
         except Exception as error:  # torch.load raises errors of many types for other files
             reason = (str(error).splitlines() or [type(error).__name__])[0]
@@ -134,8 +142,17 @@ class TrainingState:
             )
         self.model.load_state_dict(training["weights"])
         self.optimizer.load_state_dict(training["optimizer"])
-        self.ema = content["state_dict"]
+        self.ema = {name: value.to(self.device) for name, value in content["state_dict"].items()}
         self.step = training["step"]
+
+
+def _on_cpu(content: Any) -> Any:
+    """The same content with its tensors on the CPU, so that a computer without a GPU reads it."""
+    if isinstance(content, Tensor):
+        return content.cpu()
+    if isinstance(content, dict):
+        return {name: _on_cpu(value) for name, value in content.items()}
+    return [_on_cpu(value) for value in content] if isinstance(content, list) else content
 
 
 def _with_missing_parts(tensors: dict[str, Tensor], model: IDESplat) -> dict[str, Tensor]:

@@ -125,7 +125,7 @@ def scene_loss(
         views = with_input_views(views, step)
     with record_correlations(model) as correlations:
         output = run_phase(model, views, phase)
-    loss = torch.zeros(())
+    loss = torch.zeros((), device=views.images.device)
     entry = scene_metrics(output, views)
     if objective is not Objective.PHOTOMETRIC and views.inverse_depth is not None:
         spacing = candidate_spacing(model.config, views.near, views.far)

@@ -81,8 +81,9 @@ class FullNetworkTask(TrainingTask[TrainingViews]):
         return self.source(spec)
 
     def loss(self, model: IDESplat, sample: TrainingViews, step: int, phase: Phase) -> Losses:
-        """As `scene_loss`."""
-        return scene_loss(model, sample, phase, self.objective, self.perceptual, step, self.terms)
+        """As `scene_loss`, on the device of the network."""
+        views = sample.to(next(model.parameters()).device)
+        return scene_loss(model, views, phase, self.objective, self.perceptual, step, self.terms)
 
 
 class HeadTask(TrainingTask[HeadSample]):

@@ -57,6 +57,7 @@ def train(
     features: Path | None = None,
     processes: int = 1,
     threads: int = 1,
+    device: str = "cpu",
     save_every: float = 180.0,
     validate_every: int = 200,
     on_start: Callable[[], None] | None = None,
@@ -66,6 +67,7 @@ def train(
 
     config: the network's, if not that of the preset. features: folder of cached features, by default one inside `out`.
     processes: data-parallel processes, at most the batch size. threads: PyTorch's, in each process.
+    device: where the network is trained, `cpu` or `cuda`; scenes are rendered and Gaussians composited on the CPU.
     save_every: seconds between checkpoints. validate_every: steps between validations. on_start: called once weights
     and data are loaded. on_step: called after each step. LPIPS is left out where it is not installed.
 
@@ -74,10 +76,11 @@ def train(
     config = config or network_config(settings)
     if processes > settings.batch:
         raise InputError(f"--processes {processes}: more than the {settings.batch} scenes of a step; raise --batch")
-    trainer = Trainer(out, settings, config, features, ProcessGroup(0, processes), threads)
+    _check_device(device, settings)
+    trainer = Trainer(out, settings, config, features, ProcessGroup(0, processes), threads, device)
     if on_start is not None:
         on_start()
-    with spawn_workers(processes, _work, out, settings, config, features, threads, validate_every):
+    with spawn_workers(processes, _work, out, settings, config, features, threads, device, validate_every):
         trainer.fit(save_every, validate_every, on_step)
 
 
@@ -88,10 +91,11 @@ def _work(
     config: IDESplatConfig,
     features: Path | None,
     threads: int,
+    device: str,
     validate_every: int,
 ) -> None:
     """The loop of a process other than rank 0."""
-    Trainer(folder, settings, config, features, group, threads).fit(math.inf, validate_every)
+    Trainer(folder, settings, config, features, group, threads, device).fit(math.inf, validate_every)
 
 
 class Trainer:
@@ -105,23 +109,25 @@ class Trainer:
         features: Path | None = None,
         group: ProcessGroup | None = None,
         threads: int = 1,
+        device: str = "cpu",
     ) -> None:
         """Start the run, or resume it from the checkpoint in the folder; raises InputError if that is another run's.
 
         features: folder of cached features, by default one inside `folder`. group: the processes of the run.
-        threads: PyTorch's, in this process.
+        threads: PyTorch's, in this process. device: where the network is trained.
         """
         _prepare_process(threads)
         self.folder, self.settings, self.group = folder, settings, group or ProcessGroup()
         trained = HeadTask.trained if settings.part == Part.HEAD else FullNetworkTask.trained
-        self.state = TrainingState(config, settings.seed, settings.lr, settings.vit_lr, trained)
+        rates = settings.lr, settings.vit_lr, settings.photo_lr
+        self.state = TrainingState(config, settings.seed, *rates, trained, device)
         resumed = (folder / CHECKPOINT).exists()
         if resumed:
             self.state.resume(folder / CHECKPOINT, asdict(settings))
         elif settings.init:
             self.state.start_from(Path(settings.init))
         self.source, self.held_out = _sources(settings, config)
-        self.task = _task(settings, self.state.model, self.source, features or folder / FEATURES)
+        self.task = _task(settings, self.state.model, self.source, features or folder / FEATURES, device)
         self.phases = self.task.phases
         if not resumed:
             self.task.prepare(self.state.model)
@@ -206,10 +212,12 @@ def _sources(settings: TrainingSettings, config: IDESplatConfig) -> tuple[Source
     )
 
 
-def _task(settings: TrainingSettings, model: IDESplat, source: Source, features: Path) -> TrainingTask[Any]:
-    """The task that the settings describe. features: folder of cached features."""
+def _task(
+    settings: TrainingSettings, model: IDESplat, source: Source, features: Path, device: str
+) -> TrainingTask[Any]:
+    """The task that the settings describe. features: folder of cached features. device: that of the network."""
     size, batch = settings.size, settings.batch
-    perceptual = _perceptual(settings) if settings.renders else None
+    perceptual = _perceptual(settings, device) if settings.renders else None
     if settings.part == Part.HEAD:
         description = repr((size, settings.data, settings.textures, HeadInputs._fields))
         cache = FeatureCache(features, model, source, description)
@@ -220,16 +228,26 @@ def _task(settings: TrainingSettings, model: IDESplat, source: Source, features:
     )
 
 
-def _perceptual(settings: TrainingSettings) -> Perceptual | None:
+def _perceptual(settings: TrainingSettings, device: str) -> Perceptual | None:
     """The perceptual distance of the settings; None also if that is LPIPS, and LPIPS is not installed."""
     if settings.perceptual == PerceptualKind.LITE0:
-        return EfficientNetDistance()
+        return EfficientNetDistance(device)
     if settings.perceptual == PerceptualKind.NONE:
         return None
     try:
-        return load_lpips()
+        return load_lpips(device)
     except InputError:
         return None
+
+
+def _check_device(device: str, settings: TrainingSettings) -> None:
+    """Raise InputError for a device that is not there, or not for what is trained."""
+    if device == "cpu":
+        return
+    if settings.part == Part.HEAD:
+        raise InputError(f"--device {device}: --train head runs on the CPU, with cached features; leave out --device")
+    if not torch.cuda.is_available():
+        raise InputError(f"--device {device}: PyTorch {torch.__version__} finds no such GPU; leave out --device")
 
 
 def _prepare_process(threads: int) -> None:

@@ -31,6 +31,7 @@ def validate(
     rows: list[np.ndarray] = []
     for seed in VALIDATION_SEEDS[:SCENES]:
         views = load(SampleSpec(seed, 2, (1,) * phase.gaussians, side, side))
+        views = views.to(next(model.parameters()).device)
         output = run_phase(model, views, phase)
         entries.append(scene_metrics(output, views))
         if len(rows) < SHOWN_SCENES:
@@ -42,8 +43,8 @@ def validate(
 def _row(views: TrainingViews, output: PhaseOutput) -> np.ndarray:
     """Image, truth, prediction and error of the first view, then the first target view and its rendering."""
     predicted = resize(output.inverse_depth, *views.images.shape[2:])[0, 0]
-    truth = None if views.inverse_depth is None else views.inverse_depth[0].numpy()
-    row = [compare_depth(views.images[0].numpy(), truth, predicted.numpy())]
+    truth = None if views.inverse_depth is None else views.inverse_depth[0].cpu().numpy()
+    row = [compare_depth(views.images[0].cpu().numpy(), truth, predicted.cpu().numpy())]
     if output.rendered is not None:
-        row += [to_bgr(views.target_images[0].numpy()), to_bgr(output.rendered[0].numpy())]
+        row += [to_bgr(views.target_images[0].cpu().numpy()), to_bgr(output.rendered[0].cpu().numpy())]
     return np.concatenate(row, axis=1)

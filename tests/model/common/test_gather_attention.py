@@ -3,26 +3,32 @@
 import numpy as np
 import onnx
 import onnxruntime
+import pytest
 import torch
 from idesplat.export.graph.gather_loops import FEW, chunked
 from idesplat.export.graph.subgraph import names_read
 from idesplat.model.common import gather_attention as gathered
 from idesplat.model.common.gather_attention import GatherAttention
 from idesplat.tools.benchmark.gather_attention import INPUTS, Both, exported
-from idesplat.tools.training import gather_attention as compiled
+from idesplat.tools.training import gather_attention as training
 
 PAIRS, CANDIDATES, PIXELS, CHANNELS = 4, 11, 30, 6
 BLOCK = 8
 
 
-def test_values_and_gradients_are_the_networks_own() -> None:
+@pytest.mark.parametrize("by", ("numba", "torch"))  # as on a CPU, as on a GPU
+def test_values_and_gradients_are_the_networks_own(by: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    if by == "torch":
+        monkeypatch.setattr(training, "CHUNK", 4)  # fewer than CANDIDATES, and no divisor of them
+        for name in ("dot", "weighted_sum", "scatter_add"):
+            monkeypatch.setattr(training, f"_{name}", getattr(training, f"{name}_in_chunks"))
     torch.manual_seed(0)
     rows = torch.randint(0, PAIRS * PIXELS + 1, (PAIRS, CANDIDATES, PIXELS))  # the last row is of zeros
     queries, weights = torch.randn(PAIRS, PIXELS, CHANNELS), torch.rand(PAIRS, CANDIDATES, PIXELS)
     table = gathered.pixel_table(torch.randn(PAIRS, PIXELS, CHANNELS))
     for name, left in (("gathered_dot", queries), ("gathered_weighted_sum", weights)):
         results = []
-        for module in (gathered, compiled):
+        for module in (gathered, training):
             inputs = [part.clone().requires_grad_() for part in (left, table)]
             product = getattr(module, name)(*inputs, rows)
             gradients = torch.autograd.grad(product.square().sum(), inputs)

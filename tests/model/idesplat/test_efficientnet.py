@@ -12,7 +12,7 @@ from idesplat.model.registry import PRESETS
 from idesplat.runtime.errors import InputError
 from idesplat.tools.training import initialization as initialisation
 from idesplat.tools.training.initialization import load_imagenet_weights, new_model
-from idesplat.tools.training.state import FROZEN_PREFIX, TrainingState
+from idesplat.tools.training.state import PHOTO_NETWORK_PREFIX, WEIGHT_DECAY, TrainingState
 
 LITE = PRESETS["idesplat-lite"]
 # What the package efficientnet-lite-pytorch 0.1.0 computes with the published weights for the image below, before any
@@ -46,7 +46,7 @@ def test_lite_preset_keeps_to_its_size() -> None:
     with torch.device("meta"):
         model = IDESplat(LITE)
     counts = {name: parameter.numel() for name, parameter in model.named_parameters()}
-    frozen = sum(count for name, count in counts.items() if name.startswith(FROZEN_PREFIX))
+    frozen = sum(count for name, count in counts.items() if name.startswith(PHOTO_NETWORK_PREFIX))
     assert frozen == 692_688
     assert sum(counts.values()) - frozen <= 4_000_000
     assert 4 * sum(counts.values()) <= 20e6  # bytes as float32
@@ -57,12 +57,23 @@ def test_new_network_has_the_published_weights_and_keeps_them() -> None:
     state = TrainingState(LITE, seed=0, lr=1e-3, vit_lr=1e-3)
     network = EfficientNetLite0()
     load_imagenet_weights(network)
-    frozen = {name: value for name, value in state.model.named_parameters() if name.startswith(FROZEN_PREFIX)}
-    assert all(torch.equal(frozen[FROZEN_PREFIX + name], value) for name, value in network.named_parameters())
+    frozen = {name: value for name, value in state.model.named_parameters() if name.startswith(PHOTO_NETWORK_PREFIX)}
+    assert all(torch.equal(frozen[PHOTO_NETWORK_PREFIX + name], value) for name, value in network.named_parameters())
     assert not any(value.requires_grad for value in frozen.values())
     trained = {id(p) for group in state.optimizer.param_groups for p in group["params"]}
     assert len(trained) == sum(1 for p in state.model.parameters() if p.requires_grad)
     assert not trained & {id(value) for value in frozen.values()}
+
+
+def test_a_learning_rate_of_their_own_trains_the_published_weights() -> None:
+    state = TrainingState(LITE, seed=0, lr=0.0, vit_lr=0.0, photo_lr=1e-4)
+    stem = state.model.get_parameter(PHOTO_NETWORK_PREFIX + "stem.weight")
+    before = stem.detach().clone()
+    stem.grad = torch.ones_like(stem)
+    state.update(0.5)
+    # Weights decay by the learning rate's share, and Adam's first step is the learning rate.
+    expected = before * (1 - 0.5e-4 * WEIGHT_DECAY) - 0.5e-4
+    torch.testing.assert_close(stem.detach(), expected, rtol=1e-6, atol=1e-6)
 
 
 def test_missing_weights_are_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

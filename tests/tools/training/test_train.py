@@ -31,7 +31,7 @@ from idesplat.tools.training.data.samples import SampleSpec, prefetch
 from idesplat.tools.training.data.synthetic import generate_views, training_spec
 from idesplat.tools.training.initialization import new_model
 from idesplat.tools.training.log import TrainingLog
-from idesplat.tools.training.options import Objective
+from idesplat.tools.training.options import Device, Objective, Part
 from idesplat.tools.training.perceptual import load_lpips
 from idesplat.tools.training.run_files import CHECKPOINT, CURVES, LOG, PREDICTIONS
 from idesplat.tools.training.schedule import Phase, lr_factor, phase_at, training_phases
@@ -341,7 +341,7 @@ def refused(**options: object) -> str:
     return str(error.value)
 
 
-def test_bad_inputs_are_one_line_each(finished: Path, tmp_path: Path) -> None:
+def test_bad_inputs_are_one_line_each(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "run"
     assert "idesplat-tiny" in refused(out=out, preset="idesplat-huge")
     assert "no such preset" in refused(out=out, preset="depthsplat-small-re10k")
@@ -353,6 +353,10 @@ def test_bad_inputs_are_one_line_each(finished: Path, tmp_path: Path) -> None:
     assert "no such file" in refused(out=out, init=tmp_path / "absent.ckpt")
     assert "does not fit the network" in refused(out=out, init=finished / CHECKPOINT)
     assert "other settings" in refused(out=finished, steps=9)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert "--device cuda: PyTorch" in refused(out=out, device=Device.CUDA)
+    head = {"part": Part.HEAD, "init": finished / CHECKPOINT}
+    assert "--train head runs on the CPU" in refused(out=out, device=Device.CUDA, **head)
     (tmp_path / CHECKPOINT).write_bytes(b"not a checkpoint")
     assert "not a checkpoint of a training run" in refused(out=tmp_path)
     torch.save({"state_dict": {}}, tmp_path / CHECKPOINT)

@@ -3,9 +3,10 @@
 from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
+import torch
 from torch import Tensor
 
 # Samples that are loaded ahead of their use.
@@ -48,6 +49,10 @@ class TrainingViews:
     # Of captures, where given: a point for each pixel of the context views, in a frame and a scale of its own, NaN
     # where unknown, [context * H * W, 3].
     pointmap: Tensor | None = None
+
+    def to(self, device: torch.device) -> "TrainingViews":
+        """The same views on a device."""
+        return replace(self, **{name: part.to(device) for name, part in vars(self).items() if part is not None})
 
 
 def prefetch(specs: Iterator[SampleSpec], load: Callable[[SampleSpec], T]) -> Generator[T]:

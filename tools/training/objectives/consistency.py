@@ -53,11 +53,16 @@ def matched_loss(
     """
     height, width = second_depth.shape
     points = triangulate(matches.first, matches.second, matches.second_from_first)
-    transform = torch.from_numpy(matches.second_from_first).float()
-    z_first = torch.from_numpy(points[:, 2]).float()
-    z_second = torch.from_numpy(points @ matches.second_from_first[2, :3] + matches.second_from_first[2, 3]).float()
+    transform, z_first, z_second = (
+        torch.from_numpy(part).to(first_depth)
+        for part in (
+            matches.second_from_first,
+            points[:, 2],
+            points @ matches.second_from_first[2, :3] + matches.second_from_first[2, 3],
+        )
+    )
     good = (z_first > MIN_DEPTH) & (z_second > MIN_DEPTH)
-    first, second = (torch.from_numpy(x).float()[good] for x in (matches.first, matches.second))
+    first, second = (torch.from_numpy(x).to(first_depth)[good] for x in (matches.first, matches.second))
     ratio = (z_first / z_second)[good].log()
 
     at_first, at_second = _sample(first_depth, first, first_K), _sample(second_depth, second, second_K)
@@ -73,7 +78,7 @@ def matched_loss(
 def _matches(views: TrainingViews) -> Iterator[tuple[int, int, PointMatches]]:
     """The matches of each ordered pair of context views."""
     arrays = (views.images, views.extrinsics, views.intrinsics)
-    images, extrinsics, intrinsics = (part.detach().numpy() for part in arrays)
+    images, extrinsics, intrinsics = (part.detach().cpu().numpy() for part in arrays)
     matcher = ViewMatcher(images, extrinsics.astype(np.float64), intrinsics)
     for i, j in permutations(range(len(images)), 2):
         yield i, j, matcher.match(i, j)
