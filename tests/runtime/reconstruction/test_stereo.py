@@ -5,17 +5,14 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from idesplat.runtime.cameras.camera import Camera
 from idesplat.runtime.inference.predictor import Prediction
 from idesplat.runtime.reconstruction.stereo import MIN_VIEWS, correct_depths
-from idesplat.runtime.splats.gaussians import Gaussians
-from idesplat.runtime.splats.points import unproject
 from idesplat.runtime.views.batch import ViewBatch
+from views_in_a_row import prediction_of, views_in_a_row
 
 VIEWS, HEIGHT, WIDTH = 5, 48, 128
 PLANE, FOCAL, BASELINE = 4.0, 80.0, 0.5  # neighbours see the plane 10 pixels apart
 K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
-INTRINSICS = K / [[WIDTH], [HEIGHT], [1]]
 INNER = (slice(6, -6), slice(44, -44))  # pixels that all views see, without those whose patch crosses the frame
 
 
@@ -25,27 +22,7 @@ def plane_views(count: int = VIEWS, textured: bool = True) -> ViewBatch:
     noise = np.random.default_rng(0).random((HEIGHT, WIDTH + shift * count)).astype(np.float32)
     wall = cv2.GaussianBlur(noise, (0, 0), 1.5) if textured else np.full_like(noise, 0.5)
     images = np.stack([wall[:, shift * view : shift * view + WIDTH] for view in range(count)])
-    extrinsics = np.tile(np.eye(4), (count, 1, 1))
-    extrinsics[:, 0, 3] = BASELINE * np.arange(count)
-    names = [f"{view}.png" for view in range(count)]
-    cameras = [Camera(name, WIDTH, HEIGHT, K, pose) for name, pose in zip(names, extrinsics, strict=True)]
-    return ViewBatch(
-        names,
-        np.repeat(images[:, None], 3, 1),
-        extrinsics,
-        np.tile(INTRINSICS.astype(np.float32), (count, 1, 1)),
-        cameras,
-    )
-
-
-def predicted(depth: np.ndarray, views: ViewBatch) -> Prediction:
-    """A prediction whose Gaussians lie at the depth, [views, height, width], one unit large."""
-    means = unproject(depth, views.extrinsics, views.intrinsics).reshape(-1, 3).astype(np.float32)
-    ones = np.ones(len(means), np.float32)
-    gaussians = Gaussians(
-        means, np.ones((len(means), 3), np.float32), np.ones((len(means), 4), np.float32), ones, means[:, None] * 0
-    )
-    return Prediction(depth.astype(np.float32), gaussians)
+    return views_in_a_row(np.repeat(images[:, None], 3, 1), BASELINE * np.arange(count), K)
 
 
 def corrected(depth: np.ndarray, views: ViewBatch) -> Prediction:
@@ -54,7 +31,7 @@ def corrected(depth: np.ndarray, views: ViewBatch) -> Prediction:
     voters = [
         np.array(sorted(set(range(count)) - {view}, key=lambda other: abs(other - view))) for view in range(count)
     ]
-    return correct_depths(predicted(depth, views), views, voters)
+    return correct_depths(prediction_of(depth, views), views, voters)
 
 
 def plane_depth(count: int = VIEWS) -> np.ndarray:
@@ -87,7 +64,7 @@ def test_gaussians_move_along_their_rays_and_keep_their_size_in_the_image() -> N
     depth, views = plane_depth(), plane_views()
     depth[2] *= 1.1
     done = corrected(depth, views)
-    expected = predicted(done.depth, views).need_gaussians()
+    expected = prediction_of(done.depth, views).need_gaussians()
     gaussians = done.need_gaussians()
     np.testing.assert_allclose(gaussians.means, expected.means, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(gaussians.scales[:, 0], (done.depth / depth).ravel(), rtol=1e-6)
