@@ -32,7 +32,7 @@ def check_lpips() -> None:
         raise InputError(f"LPIPS is left out, since VGG16's weights are not at {weights}")
 
 
-def load_lpips_network() -> Any:
+def load_lpips_network(device: str = "cpu") -> Any:
     """LPIPS with VGG16 (Zhang et al. 2018) of the package lpips, with frozen weights; nothing is downloaded.
 
     Raises InputError as `check_lpips`.
@@ -40,12 +40,12 @@ def load_lpips_network() -> Any:
     check_lpips()
     import lpips
 
-    return lpips.LPIPS(net="vgg", verbose=False).requires_grad_(False)
+    return lpips.LPIPS(net="vgg", verbose=False).requires_grad_(False).to(device)
 
 
 def load_lpips(device: str = "cpu") -> Perceptual:
     """The mean LPIPS of images on a device; raises InputError as `check_lpips`."""
-    network = load_lpips_network().to(device)
+    network = load_lpips_network(device)
     return lambda rendered, truth: network(rendered, truth, normalize=True).mean()
 
 

@@ -64,7 +64,7 @@ def test_options_have_the_same_letters_everywhere():
 def test_options_that_several_commands_have_mean_the_same():
     """By their help texts; what is named here means something else for each command."""
     own = {"--out", "--views", "--size", "--cameras", "--json", "--precision", "--preset", "--scenes", "--verbose"}
-    own |= {"--depth", "--render", "--threads", "--focal", "--steps", "--seed"}
+    own |= {"--depth", "--render", "--threads", "--focal", "--steps", "--seed", "--device"}
     texts: dict[str, set[str]] = {}
     for _, command in commands():
         for parameter in command.params:

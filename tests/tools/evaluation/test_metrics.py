@@ -123,7 +123,7 @@ def test_lpips_gets_the_truth_at_invalid_pixels(monkeypatch: pytest.MonkeyPatch)
         assert normalize and x.shape == y.shape == (1, 3, 4, 5)
         return (x - y).abs().sum()
 
-    monkeypatch.setattr(perceptual, "load_lpips_network", lambda: network)
+    monkeypatch.setattr(perceptual, "load_lpips_network", lambda device: network)
     lpips = load_lpips()
     truth = np.zeros((4, 5, 3))
     valid = np.ones((4, 5), bool)
