@@ -1,6 +1,6 @@
 """Gather attention of epipolar layers for training; it stores no gathered features.
 
-On a CPU the sums are compiled with numba, elsewhere they are PyTorch's.
+On a CPU the sums are compiled with numba, elsewhere they are the network's own, in larger chunks.
 """
 
 from typing import Any
@@ -9,12 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ...model.common import gather_attention as networks
 from ...model.common.gather_attention import GatherAttention
 from ...model.idesplat.network import IDESplat
 from ...runtime.system.compilation import compiled
 
-# Candidates gathered at a time where the sums are PyTorch's, which bounds memory to this many copies of the features.
-CHUNK = 32
+# The type of device that the sums are compiled for. Elsewhere so many candidates are gathered at a time, which bounds
+# memory to this many copies of the features.
+COMPILED_FOR, CHUNK = "cpu", 32
 
 _compiled = compiled(fastmath={"contract", "arcp", "nsz", "reassoc"})
 
@@ -67,8 +69,8 @@ def gathered_weighted_sum(probability: Tensor, table: Tensor, rows: Tensor) -> T
 
 def _dot(pixels: Tensor, table: Tensor, rows: Tensor) -> Tensor:
     """out[p, c, i] = pixels[p, i] . table[rows[p, c, i]]."""
-    if pixels.device.type != "cpu":
-        return dot_in_chunks(pixels, table, rows)
+    if pixels.device.type != COMPILED_FOR:
+        return networks.gathered_dot(pixels, table, rows, CHUNK)
     out = torch.empty(rows.shape, dtype=pixels.dtype)
     _compiled_dot(pixels.numpy(), table.numpy(), rows.numpy(), out.numpy())
     return out
@@ -76,8 +78,8 @@ def _dot(pixels: Tensor, table: Tensor, rows: Tensor) -> Tensor:
 
 def _weighted_sum(weights: Tensor, table: Tensor, rows: Tensor) -> Tensor:
     """out[p, i] = sum over c of weights[p, c, i] * table[rows[p, c, i]]."""
-    if weights.device.type != "cpu":
-        return weighted_sum_in_chunks(weights, table, rows)
+    if weights.device.type != COMPILED_FOR:
+        return networks.gathered_weighted_sum(weights, table, rows, CHUNK)
     out = table.new_zeros(rows.shape[0], rows.shape[2], table.shape[1])
     _compiled_weighted_sum(weights.numpy(), table.numpy(), rows.numpy(), out.numpy())
     return out
@@ -85,30 +87,12 @@ def _weighted_sum(weights: Tensor, table: Tensor, rows: Tensor) -> Tensor:
 
 def _scatter_add(weights: Tensor, pixels: Tensor, table: Tensor, rows: Tensor) -> Tensor:
     """The gradient of the table: out[rows[p, c, i]] += weights[p, c, i] * pixels[p, i]."""
-    if weights.device.type != "cpu":
-        return scatter_add_in_chunks(weights, pixels, table, rows)
     out = torch.zeros_like(table)
-    _compiled_scatter_add(weights.numpy(), pixels.numpy(), rows.numpy(), out.numpy())
-    return out
-
-
-def dot_in_chunks(pixels: Tensor, table: Tensor, rows: Tensor) -> Tensor:
-    """As `_dot`, by PyTorch on any device."""
-    return torch.cat([(table[part] * pixels[:, None]).sum(-1) for part in rows.split(CHUNK, dim=1)], dim=1)
-
-
-def weighted_sum_in_chunks(weights: Tensor, table: Tensor, rows: Tensor) -> Tensor:
-    """As `_weighted_sum`, by PyTorch on any device."""
-    parts = zip(weights.split(CHUNK, dim=1), rows.split(CHUNK, dim=1), strict=True)
-    sums = [(table[of_rows] * of_weights[..., None]).sum(1) for of_weights, of_rows in parts]
-    return torch.stack(sums).sum(0)
-
-
-def scatter_add_in_chunks(weights: Tensor, pixels: Tensor, table: Tensor, rows: Tensor) -> Tensor:
-    """As `_scatter_add`, by PyTorch on any device."""
-    out = torch.zeros_like(table)
-    for of_weights, of_rows in zip(weights.split(CHUNK, dim=1), rows.split(CHUNK, dim=1), strict=True):
-        out.index_add_(0, of_rows.flatten(), (of_weights[..., None] * pixels[:, None]).flatten(0, 2))
+    if weights.device.type == COMPILED_FOR:
+        _compiled_scatter_add(weights.numpy(), pixels.numpy(), rows.numpy(), out.numpy())
+        return out
+    for some_weights, some_rows in zip(weights.split(CHUNK, dim=1), rows.split(CHUNK, dim=1), strict=True):
+        out.index_add_(0, some_rows.flatten(), (some_weights[..., None] * pixels[:, None]).flatten(0, 2))
     return out
 
 

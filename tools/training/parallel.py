@@ -45,9 +45,9 @@ class ProcessGroup:
         if self.size == 1:
             return
         trained = [p for p in parameters if p.requires_grad]
-        found = torch.tensor([float(p.grad is not None) for p in trained])
+        found = torch.tensor([float(p.grad is not None) for p in trained], device=trained[0].device)
         parts = [torch.zeros_like(p).flatten() if p.grad is None else p.grad.flatten() for p in trained]
-        flat = torch.cat([found, torch.cat(parts).cpu()])  # gloo exchanges what is in the memory of the CPU
+        flat = torch.cat([found, *parts]).cpu()  # gloo exchanges what is in the memory of the CPU
         with _peer_errors():
             dist.all_reduce(flat)
         found, *parts = flat.split([len(trained), *(p.numel() for p in trained)])

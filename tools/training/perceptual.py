@@ -19,6 +19,7 @@ Perceptual = Callable[[Tensor, Tensor], Tensor]
 VGG_WEIGHTS = "vgg16-397923af.pth"
 # Of EfficientNet-Lite0's feature maps, the first three are used: at strides 2, 4 and 8.
 LEVELS = 3
+CPU = torch.device("cpu")
 
 
 def check_lpips() -> None:
@@ -32,7 +33,7 @@ def check_lpips() -> None:
         raise InputError(f"LPIPS is left out, since VGG16's weights are not at {weights}")
 
 
-def load_lpips_network(device: str = "cpu") -> Any:
+def load_lpips_network(device: torch.device = CPU) -> Any:
     """LPIPS with VGG16 (Zhang et al. 2018) of the package lpips, with frozen weights; nothing is downloaded.
 
     Raises InputError as `check_lpips`.
@@ -43,7 +44,7 @@ def load_lpips_network(device: str = "cpu") -> Any:
     return lpips.LPIPS(net="vgg", verbose=False).requires_grad_(False).to(device)
 
 
-def load_lpips(device: str = "cpu") -> Perceptual:
+def load_lpips(device: torch.device = CPU) -> Perceptual:
     """The mean LPIPS of images on a device; raises InputError as `check_lpips`."""
     network = load_lpips_network(device)
     return lambda rendered, truth: network(rendered, truth, normalize=True).mean()
@@ -55,7 +56,7 @@ class EfficientNetDistance:
     d(a, b) = mean over levels and pixels of |f(a) / |f(a)| - f(b) / |f(b)||^2, with feature vectors f of a pixel.
     """
 
-    def __init__(self, device: str = "cpu") -> None:
+    def __init__(self, device: torch.device = CPU) -> None:
         """Load the network for images on a device; raises InputError if the package of its weights is missing."""
         self.network = EfficientNetLite0().requires_grad_(False)
         load_imagenet_weights(self.network)

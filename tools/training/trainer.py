@@ -127,7 +127,7 @@ class Trainer:
         elif settings.init:
             self.state.start_from(Path(settings.init))
         self.source, self.held_out = _sources(settings, config)
-        self.task = _task(settings, self.state.model, self.source, features or folder / FEATURES, device)
+        self.task = _task(settings, self.state.model, self.source, features or folder / FEATURES)
         self.phases = self.task.phases
         if not resumed:
             self.task.prepare(self.state.model)
@@ -212,12 +212,10 @@ def _sources(settings: TrainingSettings, config: IDESplatConfig) -> tuple[Source
     )
 
 
-def _task(
-    settings: TrainingSettings, model: IDESplat, source: Source, features: Path, device: str
-) -> TrainingTask[Any]:
-    """The task that the settings describe. features: folder of cached features. device: that of the network."""
+def _task(settings: TrainingSettings, model: IDESplat, source: Source, features: Path) -> TrainingTask[Any]:
+    """The task that the settings describe. features: folder of cached features."""
     size, batch = settings.size, settings.batch
-    perceptual = _perceptual(settings, device) if settings.renders else None
+    perceptual = _perceptual(settings, next(model.parameters()).device) if settings.renders else None
     if settings.part == Part.HEAD:
         description = repr((size, settings.data, settings.textures, HeadInputs._fields))
         cache = FeatureCache(features, model, source, description)
@@ -228,7 +226,7 @@ def _task(
     )
 
 
-def _perceptual(settings: TrainingSettings, device: str) -> Perceptual | None:
+def _perceptual(settings: TrainingSettings, device: torch.device) -> Perceptual | None:
     """The perceptual distance of the settings; None also if that is LPIPS, and LPIPS is not installed."""
     if settings.perceptual == PerceptualKind.LITE0:
         return EfficientNetDistance(device)
