@@ -143,6 +143,7 @@ def reconstruct(
         inputs.notes + found.notes + notes + fused.notes + finished.notes,
         found,
         finished.psnr,
+        finished.exposure,
     )
 
 

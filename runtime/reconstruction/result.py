@@ -41,7 +41,8 @@ class Reconstruction:
     model: the model's files. depth_range: near and far in scene units, and their source.
     filters: the options. removed: number of Gaussians that each filter removed, by name.
     timings: seconds by step. notes: lines for the user. exposure: how the views were brought to a common exposure.
-    psnr: of the refinement's views before each of its steps.
+    psnr: of the refinement's views before each of its steps. refined_exposure: what the refinement found beside, from
+    the views in their common exposure to the scene; None without refinement.
     """
 
     prediction: Prediction
@@ -54,6 +55,7 @@ class Reconstruction:
     notes: list[str]
     exposure: Exposure
     psnr: list[float] = field(default_factory=list)
+    refined_exposure: Exposure | None = None
 
     @property
     def gaussians(self) -> Gaussians | None:
@@ -148,6 +150,13 @@ class Reconstruction:
             "files": [str(path) for path in files],
             "offset": self.views.offset.tolist(),
             "exposure": self.exposure.summary(),
-            "refinement": {"steps": len(self.psnr), "psnr": self.psnr[-len(self.views.names) :]},
+            "refinement": self._refinement(),
             "filtered": {"asked": asdict(self.filters), "left_out": self.removed},
         }
+
+    def _refinement(self) -> dict[str, Any]:
+        """The number of steps, the PSNR of the last ones, and the exposure of each view that was found beside."""
+        found = {"steps": len(self.psnr), "psnr": self.psnr[-len(self.views.names) :]}
+        if self.refined_exposure is None:
+            return found
+        return found | {part: getattr(self.refined_exposure, part).tolist() for part in ("gains", "offsets")}

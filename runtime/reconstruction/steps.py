@@ -18,6 +18,7 @@ from ..splats.fusion import MIN_VOTING_VIEWS
 from ..splats.gaussians import Gaussians
 from ..views.batch import ViewBatch
 from ..views.depth_range import DepthRange
+from ..views.exposure import Exposure
 from .many_views import voting_views
 from .quality import PRESETS, Preset, Quality, RefinementLimit, default_quality, parse_refine
 from .stereo import correct_depths
@@ -55,13 +56,18 @@ class Plan:
 
 @dataclass(frozen=True)
 class Stepped:
-    """A prediction after a step, with what the step has to say. psnr: of the refinement's views before each step."""
+    """A prediction after a step, with what the step has to say.
+
+    psnr: of the refinement's views before each step. exposure: from the views that were refined on to the scene; None
+    without refinement.
+    """
 
     prediction: Prediction
     removed: dict[str, int] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     psnr: list[float] = field(default_factory=list)
+    exposure: Exposure | None = None
 
 
 def make_plan(
@@ -123,7 +129,8 @@ def refine_prediction(
         notes.append(
             f"refined in {refined.steps} steps, {seconds:.0f} s: PSNR of the input views {first:.1f} to {last:.1f} dB"
         )
-    return Stepped(replace(prediction, gaussians=gaussians), {}, {"refine": seconds}, notes, refined.psnr)
+    exposure = Exposure(1 / refined.gains, -refined.offsets / refined.gains)
+    return Stepped(replace(prediction, gaussians=gaussians), {}, {"refine": seconds}, notes, refined.psnr, exposure)
 
 
 def _clear_free_space(gaussians: Gaussians, prediction: Prediction, views: ViewBatch, plan: Plan) -> Gaussians:

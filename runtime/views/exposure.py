@@ -93,6 +93,14 @@ class Exposure:
         gains, offsets = (part[..., None, None].astype(images.dtype) for part in (self.gains, self.offsets))
         return np.clip(gains * images + offsets, 0, 1)
 
+    def then(self, second: "Exposure") -> "Exposure":
+        """This correction followed by another one of the same views."""
+        return replace(self, gains=second.gains * self.gains, offsets=second.gains * self.offsets + second.offsets)
+
+    def undo(self, image: np.ndarray, view: int) -> np.ndarray:
+        """An image in the common exposure as the camera of a view would have taken it, [height, width, 3]."""
+        return (image - self.offsets[view]) / self.gains[view]
+
     def summary(self) -> dict[str, Any]:
         """What JSON can hold of it."""
         return {

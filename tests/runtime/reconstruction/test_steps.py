@@ -7,7 +7,7 @@ import numpy as np
 from idesplat.runtime.cameras.undistortion import UndistortedImage
 from idesplat.runtime.inference.bundled_model import bundled_model
 from idesplat.runtime.inference.predictor import Prediction
-from idesplat.runtime.reconstruction.steps import make_plan, refine_prediction
+from idesplat.runtime.reconstruction.steps import Plan, make_plan, refine_prediction
 from idesplat.runtime.splats.filtering import FilterOptions
 from idesplat.runtime.splats.gaussians import Gaussians
 from idesplat.runtime.views.batch import ViewBatch
@@ -30,11 +30,14 @@ def plane_before(positions: tuple[float, ...]) -> tuple[Prediction, ViewBatch]:
     return replace(prediction, gaussians=Gaussians.concatenate([plane, floater])), replace(views, copies=copies)
 
 
+def plan_of(quality: str, steps: int) -> Plan:
+    model = SimpleNamespace(path=bundled_model(), metadata=SimpleNamespace(gaussians=True))
+    return make_plan(quality, model, str(steps), FilterOptions(), 0)
+
+
 def refined(quality: str, *positions: float) -> Gaussians:
     prediction, views = plane_before(positions)
-    model = SimpleNamespace(path=bundled_model(), metadata=SimpleNamespace(gaussians=True))
-    plan = make_plan(quality, model, "3", FilterOptions(), 0)
-    return refine_prediction(prediction, views, plan, None).prediction.need_gaussians()
+    return refine_prediction(prediction, views, plan_of(quality, 3), None).prediction.need_gaussians()
 
 
 def has_floater(gaussians: Gaussians) -> bool:
@@ -49,3 +52,12 @@ def test_no_gaussian_hangs_right_before_the_cameras_after_refinement() -> None:
 def test_a_prediction_that_is_not_fused_and_two_views_keep_what_they_have() -> None:
     assert has_floater(refined("fast", 0.0, 1.0, 2.0))
     assert has_floater(refined("standard", 0.0, 1.0))
+
+
+def test_the_exposure_of_a_darker_photograph_is_told() -> None:
+    prediction, views = plane_before((0.0, 1.0))
+    darker = replace(views.copies[1], image=(0.8 * views.copies[1].image).astype(np.uint8))
+    views = replace(views, copies=[views.copies[0], darker])
+    found = refine_prediction(prediction, views, plan_of("standard", 20), None).exposure
+    grey = np.full((1, 1, 3), 0.5)
+    assert (found.undo(grey, 1) < found.undo(grey, 0)).all()

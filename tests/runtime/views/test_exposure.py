@@ -8,7 +8,7 @@ from idesplat.runtime.cameras.io import read_cameras
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.views import loader, matching
 from idesplat.runtime.views.batch import build_view_batch
-from idesplat.runtime.views.exposure import MAX_GAIN, compensate_exposure, solve_exposure
+from idesplat.runtime.views.exposure import MAX_GAIN, Exposure, compensate_exposure, solve_exposure
 from idesplat.runtime.views.exposure_mode import ExposureMode, parse_exposure_mode
 from idesplat.runtime.views.matching import PointMatches
 
@@ -216,3 +216,12 @@ def test_modes_are_named():
     assert parse_exposure_mode("off") is OFF
     with pytest.raises(InputError, match="exposure on: expected one of auto, off"):
         parse_exposure_mode("on")
+
+
+def test_two_corrections_in_a_row_are_one_and_can_be_undone() -> None:
+    rng = np.random.default_rng(0)
+    first, second = (Exposure(rng.uniform(0.5, 2, (2, 3)), rng.uniform(-0.2, 0.2, (2, 3))) for _ in range(2))
+    image = rng.uniform(0.3, 0.7, (4, 5, 3))
+    once = first.gains[1] * image + first.offsets[1]
+    twice = second.gains[1] * once + second.offsets[1]
+    np.testing.assert_allclose(first.then(second).undo(twice, 1), image)

@@ -15,12 +15,15 @@ from conftest import run_command
 from idesplat import Predictor, read_cameras
 from idesplat.runtime.cameras.camera import Camera
 from idesplat.runtime.errors import InputError
+from idesplat.runtime.splats.gaussians import Gaussians
+from idesplat.runtime.views.exposure import Exposure
 from idesplat.tools.evaluation import evaluate as library
 from idesplat.tools.evaluation.captures import capture as captures
 from idesplat.tools.evaluation.captures import checkouts, spoiled
 from idesplat.tools.evaluation.captures.capture import CaptureImages, parse_view_counts, read_captures
 from idesplat.tools.evaluation.captures.checkouts import extract, fetch_checkout, find_checkout, list_folder
 from idesplat.tools.evaluation.captures.choose import as_json, camera_entries
+from idesplat.tools.evaluation.captures.scores import Scene
 from idesplat.tools.evaluation.cli import main
 from idesplat.tools.evaluation.metrics import HIGHEST_PSNR, fit_exposure, psnr
 from idesplat.tools.evaluation.novel_views import render_target
@@ -269,6 +272,15 @@ def test_the_command_gives_the_metrics_of_the_predictor_used_by_hand(
     assert cv2.imread("out/room-3-000-003.png").shape == (64, 4 * 96 + 3 * 4, 3)
     printed = capsys.readouterr().out
     assert "mean of 1" in printed and "wrote out/results.json" in printed
+
+
+def test_a_render_is_compared_in_the_mean_exposure_of_the_two_views_around() -> None:
+    # Photographs of gains 1, 0.5 and 0.25: the corrections of their exposure are 1, 2 and 4.
+    exposure = Exposure(np.array([[1.0] * 3, [2.0] * 3, [4.0] * 3]), np.zeros((3, 3)))
+    gaussian = Gaussians(*(np.ones(shape, np.float32) for shape in ((1, 3), (1, 3), (1, 4), (1,), (1, 1, 3))))
+    scene = Scene(gaussian, exposure, 0.0)
+    white = np.ones((2, 2, 3))
+    np.testing.assert_allclose(scene.in_exposure_of(white, [1, 2]), (0.5 + 0.25) / 2)
 
 
 @pytest.mark.slow

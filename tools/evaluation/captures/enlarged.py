@@ -89,7 +89,7 @@ def _triple_scores(
 ) -> list[float]:
     """PSNR of a triple's held-out frame, in the order of COLUMNS."""
     cases = [images.case(triple.context, [triple.target], evaluator.predictor.depth_range) for images in (small, large)]
-    gaussians = [evaluator.predict(case)[0] for case in cases]
+    gaussians = [evaluator.predict(case).gaussians for case in cases]
     targets, larger = (case.targets for case in cases)
     enlarged, inside = enlarge(render_target(gaussians[0], targets, 0).rgb, targets, larger)
     compared = inside & larger.valid[0]

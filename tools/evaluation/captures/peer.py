@@ -68,8 +68,9 @@ def compare(
             continue
         with frames_of(checkouts, source) as images:
             case = CaptureImages(source, images, SIZE).case(context, targets, predictor.depth_range)
-            scenes = {name: CaptureEvaluator(predictor, {}, plan).predict(case) for name, plan in plans.items()}
-        predicted = scenes[Quality.FAST][0]
+            ours = {name: CaptureEvaluator(predictor, {}, plan).predict(case) for name, plan in plans.items()}
+        scenes = {name: (scene.gaussians, scene.seconds) for name, scene in ours.items()}
+        predicted = ours[Quality.FAST].gaussians
         for count in steps or (plans[Quality.STANDARD].preset.steps(views),):
             scenes[f"OpenSplat, {count} steps"] = train_opensplat(opensplat, case, predicted, count)
         for name, (gaussians, seconds) in scenes.items():

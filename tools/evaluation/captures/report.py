@@ -12,7 +12,7 @@ from ..metrics import LITE0, LPIPS
 from ..novel_views import MODEL, NEAREST, ORACLE_PLANE, Scores
 from ..report import describe, print_table, write_json
 from .capture import PAIR
-from .scores import PAIRS, CaptureScores, mean_of_captures
+from .scores import INTERPOLATED, PAIRS, CaptureScores, mean_of_captures
 
 if TYPE_CHECKING:
     from ..evaluate import CaptureEvaluation
@@ -21,6 +21,7 @@ Column = tuple[str, str, str]  # heading, method and metric
 # Of the means; those that were not measured are left out.
 COLUMNS: tuple[Column, ...] = (
     ("PSNR", MODEL, "psnr"),
+    ("exposure\ninterpolated", MODEL, INTERPOLATED),
     ("fitted", MODEL, "psnr_fitted"),
     ("SSIM", MODEL, "ssim"),
     ("LPIPS", MODEL, LPIPS),
@@ -29,6 +30,7 @@ COLUMNS: tuple[Column, ...] = (
     ("oracle\nplane", ORACLE_PLANE, "psnr"),
     ("oracle plane,\nfitted", ORACLE_PLANE, "psnr_fitted"),
     ("from the\ntwo around", PAIRS, "psnr"),
+    ("exposure\ninterpolated", PAIRS, INTERPOLATED),
     ("input\nviews", MODEL, "input_psnr"),
 )
 DECIMALS = {"ssim": 3, LPIPS: 3, LITE0: 3}

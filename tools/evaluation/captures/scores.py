@@ -16,7 +16,7 @@ from ....runtime.splats.gaussians import Gaussians
 from ....runtime.system.progress import reporting_to
 from ....runtime.views.batch import ViewBatch
 from ....runtime.views.depth_range import DepthRange
-from ....runtime.views.exposure import compensate_exposure
+from ....runtime.views.exposure import Exposure, compensate_exposure
 from ....runtime.views.exposure_mode import ExposureMode
 from ..baselines import best_fronto_parallel_plane, nearest_view
 from ..cases import EvalCase, PosedImages
@@ -24,9 +24,29 @@ from ..metrics import PerceptualMetric, fit_exposure, psnr, ssim
 from ..novel_views import MODEL, NEAREST, ORACLE_PLANE, Scores, comparison_strip, render_target
 from .capture import PAIR, Capture, CaptureImages
 
+INTERPOLATED = "psnr_interpolated_exposure"
 PAIRS = "pairs"  # method: the model given the two views around each held-out frame
 
 Show = Callable[[str, np.ndarray], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """The Gaussians as `reconstruct` makes them of context views, and the seconds that it takes.
+
+    exposure: from each context view to the Gaussians' common exposure.
+    """
+
+    gaussians: Gaussians
+    exposure: Exposure
+    seconds: float
+
+    def in_exposure_of(self, image: np.ndarray, views: Sequence[int]) -> np.ndarray:
+        """A render in the mean of these context views' exposures, [height, width, 3].
+
+        With automatic exposure, a camera takes a frame between two others about so.
+        """
+        return np.mean([self.exposure.undo(image, view) for view in views], axis=0)
 
 
 @dataclass(frozen=True)
@@ -101,53 +121,62 @@ class CaptureEvaluator:
                     case = images.case(triple.context, [target], self.predictor.depth_range)
                     pairs[target] = self._triple(case, None).targets[0].scores
             case = images.case(context, targets, self.predictor.depth_range)
-            result.cases[count] = [self._window(case, pairs, show)]
+            result.cases[count] = [self._window(capture, case, pairs, show)]
         return result
 
-    def predict(self, case: EvalCase) -> tuple[Gaussians, float]:
-        """The Gaussians as `reconstruct` makes them of these views, and the seconds that it takes."""
+    def predict(self, case: EvalCase) -> Scene:
+        """The scene of the context views, without what the command prints."""
         views, span = _view_batch(case.context), DepthRange(case.near, case.far, "given")
         started = time.perf_counter()
         with reporting_to(None):
-            views, _ = compensate_exposure(views, ExposureMode.AUTO)
+            views, exposure = compensate_exposure(views, ExposureMode.AUTO)
             prediction = predict_views(self.predictor, views, span)
             prediction = fuse(prediction, views, span, self.plan).prediction
             if self.plan.copy_side:
-                prediction = refine_prediction(prediction, views, self.plan, None).prediction
-        return prediction.need_gaussians(), time.perf_counter() - started
+                refined = refine_prediction(prediction, views, self.plan, None)
+                prediction = refined.prediction
+                exposure = exposure.then(refined.exposure) if refined.exposure else exposure
+        return Scene(prediction.need_gaussians(), exposure, time.perf_counter() - started)
 
     def _triple(self, case: EvalCase, show: Show | None) -> CaseScores:
         """Evaluate a pair of views and one held-out frame, with the baselines."""
-        gaussians, seconds = self.predict(case)
+        scene = self.predict(case)
         pose, K = case.targets.extrinsics[0], case.targets.K(0)
         truth, valid = case.targets.image(0), case.targets.valid[0]
         plane, _ = best_fronto_parallel_plane(case.context, truth, valid, pose, K, case.near, case.far)
-        rendering = render_target(gaussians, case.targets, 0)
-        images = {
-            MODEL: rendering.rgb,
-            NEAREST: case.context.image(nearest_view(case.context, pose)),
-            ORACLE_PLANE: plane,
+        rendering = render_target(scene.gaussians, case.targets, 0)
+        nearest = case.context.image(nearest_view(case.context, pose))
+        scores = {
+            MODEL: self._measure_scene(scene, rendering.rgb, [0, 1], truth, valid),
+            NEAREST: self._measure(nearest, truth, valid),
+            ORACLE_PLANE: self._measure(plane, truth, valid),
         }
-        scores = {method: self._measure(image, truth, valid) for method, image in images.items()}
         if show is not None:
             show(_strip_name(case, 0), comparison_strip(truth, valid, rendering, plane))
-        return CaseScores(
-            case.context.names, [TargetScores(case.targets.names[0], scores)], _input_psnr(gaussians, case), seconds
-        )
+        targets = [TargetScores(case.targets.names[0], scores)]
+        return CaseScores(case.context.names, targets, _input_psnr(scene.gaussians, case), scene.seconds)
 
-    def _window(self, case: EvalCase, pairs: dict[str, Scores], show: Show | None) -> CaseScores:
+    def _window(self, capture: Capture, case: EvalCase, pairs: dict[str, Scores], show: Show | None) -> CaseScores:
         """Evaluate several views and the held-out frames between them; pairs: each frame's scores from two views."""
-        gaussians, seconds = self.predict(case)
+        scene = self.predict(case)
         targets = []
         for index, name in enumerate(case.targets.names):
             truth, valid = case.targets.image(index), case.targets.valid[index]
-            rendering = render_target(gaussians, case.targets, index)
-            scores = {MODEL: self._measure(rendering.rgb, truth, valid), PAIRS: pairs[name][MODEL]}
+            rendering = render_target(scene.gaussians, case.targets, index)
+            beside = [case.context.names.index(view) for view in capture.neighbours(name).context]
+            scores = {MODEL: self._measure_scene(scene, rendering.rgb, beside, truth, valid), PAIRS: pairs[name][MODEL]}
             scores |= {method: pairs[name][method] for method in (NEAREST, ORACLE_PLANE)}
             targets.append(TargetScores(name, scores))
             if show is not None:
                 show(_strip_name(case, index), comparison_strip(truth, valid, rendering, None))
-        return CaseScores(case.context.names, targets, _input_psnr(gaussians, case), seconds)
+        return CaseScores(case.context.names, targets, _input_psnr(scene.gaussians, case), scene.seconds)
+
+    def _measure_scene(
+        self, scene: Scene, image: np.ndarray, beside: Sequence[int], truth: np.ndarray, valid: np.ndarray
+    ) -> dict[str, float]:
+        """The metrics of a render between two context views, and its PSNR in their mean exposure."""
+        interpolated = scene.in_exposure_of(image, beside)
+        return self._measure(image, truth, valid) | {INTERPOLATED: psnr(interpolated, truth, valid)}
 
     def _measure(self, image: np.ndarray, truth: np.ndarray, valid: np.ndarray) -> dict[str, float]:
         scores = {
