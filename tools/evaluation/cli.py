@@ -11,6 +11,7 @@ from ...runtime.cli.options import (
     CAMERAS_HELP,
     Config,
     Device,
+    Exposure,
     Far,
     Model,
     Near,
@@ -33,6 +34,7 @@ from ...runtime.images.sizes import parse_size
 from ...runtime.inference.named_models import find_model
 from ...runtime.system.output_names import IMAGE, RESULTS, strip_file
 from ...runtime.system.outputs import outputs
+from ...runtime.views.exposure_mode import ExposureMode
 from .defaults import CONTEXT_VIEWS, HELD_OUT_SCENES, HOLD_OUT_EVERY, VIEW_COUNTS
 
 if TYPE_CHECKING:  # nothing heavy is loaded before there is something to evaluate
@@ -208,6 +210,7 @@ def captures(
     ),
     quality: QualityOption = None,
     refine: Refine = None,
+    exposure: Exposure = ExposureMode.AUTO,
     model: Model = None,
     provider: Provider = "CPU",
     provider_option: ProviderOption = None,
@@ -235,6 +238,7 @@ def captures(
         view_counts=counts,
         quality=quality,
         refine=refine,
+        exposure=exposure,
         size=parse_size(size) if size else None,
         on_target=lambda name, strip: save_png(out / f"{name}{IMAGE}", strip),
     )

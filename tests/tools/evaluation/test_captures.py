@@ -4,6 +4,7 @@ import hashlib
 import json
 import shutil
 import subprocess
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -15,15 +16,18 @@ from conftest import run_command
 from idesplat import Predictor, read_cameras
 from idesplat.runtime.cameras.camera import Camera
 from idesplat.runtime.errors import InputError
+from idesplat.runtime.reconstruction.steps import make_plan
+from idesplat.runtime.splats.filtering import FilterOptions
 from idesplat.runtime.splats.gaussians import Gaussians
 from idesplat.runtime.views.exposure import Exposure
+from idesplat.runtime.views.exposure_mode import ExposureMode
 from idesplat.tools.evaluation import evaluate as library
 from idesplat.tools.evaluation.captures import capture as captures
 from idesplat.tools.evaluation.captures import checkouts, spoiled
 from idesplat.tools.evaluation.captures.capture import CaptureImages, parse_view_counts, read_captures
 from idesplat.tools.evaluation.captures.checkouts import extract, fetch_checkout, find_checkout, list_folder
 from idesplat.tools.evaluation.captures.choose import as_json, camera_entries
-from idesplat.tools.evaluation.captures.scores import Scene
+from idesplat.tools.evaluation.captures.scores import CaptureEvaluator, Scene
 from idesplat.tools.evaluation.cli import main
 from idesplat.tools.evaluation.metrics import HIGHEST_PSNR, fit_exposure, psnr
 from idesplat.tools.evaluation.novel_views import render_target
@@ -281,6 +285,20 @@ def test_a_render_is_compared_in_the_mean_exposure_of_the_two_views_around() -> 
     scene = Scene(gaussian, exposure, 0.0)
     white = np.ones((2, 2, 3))
     np.testing.assert_allclose(scene.in_exposure_of(white, [1, 2]), (0.5 + 0.25) / 2)
+
+
+def test_exposure_is_compensated_unless_it_is_switched_off(
+    capture_file: Path, scene: Path, exported: tuple[Path, Path]
+) -> None:
+    predictor = Predictor(exported[0])
+    (capture,) = read_captures()
+    case = CaptureImages(capture, scene / "images", (64, 96)).case(NAMES[:2], NAMES[2:3], predictor.depth_range)
+    darker = case.context.images * np.float32([1.0, 0.7])[:, None, None, None]
+    case = replace(case, context=replace(case.context, images=darker))
+    plan = make_plan("fast", predictor.model, "0", FilterOptions(), 0)
+    for mode in ExposureMode:
+        scene_of_two = CaptureEvaluator(predictor, {}, plan, mode).predict(case)
+        assert scene_of_two.exposure.is_identity is (mode is ExposureMode.OFF)
 
 
 @pytest.mark.slow

@@ -88,10 +88,19 @@ class CaptureScores:
 
 
 class CaptureEvaluator:
-    """Evaluates a model on captures; perceptual: distances by name. plan: what follows the prediction."""
+    """Evaluates a model on captures; perceptual: distances by name. plan: what follows the prediction.
 
-    def __init__(self, predictor: Predictor, perceptual: Mapping[str, PerceptualMetric], plan: Plan) -> None:
-        self.predictor, self.perceptual, self.plan = predictor, perceptual, plan
+    exposure: what to do about differences of exposure between the context views.
+    """
+
+    def __init__(
+        self,
+        predictor: Predictor,
+        perceptual: Mapping[str, PerceptualMetric],
+        plan: Plan,
+        exposure: ExposureMode = ExposureMode.AUTO,
+    ) -> None:
+        self.predictor, self.perceptual, self.plan, self.exposure = predictor, perceptual, plan, exposure
 
     def evaluate(
         self, capture: Capture, images: CaptureImages, counts: Sequence[int], show: Show | None = None
@@ -129,7 +138,7 @@ class CaptureEvaluator:
         views, span = _view_batch(case.context), DepthRange(case.near, case.far, "given")
         started = time.perf_counter()
         with reporting_to(None):
-            views, exposure = compensate_exposure(views, ExposureMode.AUTO)
+            views, exposure = compensate_exposure(views, self.exposure)
             prediction = predict_views(self.predictor, views, span)
             prediction = fuse(prediction, views, span, self.plan).prediction
             if self.plan.copy_side:
