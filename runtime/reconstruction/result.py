@@ -159,4 +159,4 @@ class Reconstruction:
         found = {"steps": len(self.psnr), "psnr": self.psnr[-len(self.views.names) :]}
         if self.refined_exposure is None:
             return found
-        return found | {part: getattr(self.refined_exposure, part).tolist() for part in ("gains", "offsets")}
+        return found | self.refined_exposure.as_lists()

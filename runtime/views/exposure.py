@@ -106,9 +106,12 @@ class Exposure:
         return {
             "difference": self.difference,
             "compensated": not self.is_identity,
-            "gains": self.gains.tolist(),
-            "offsets": self.offsets.tolist(),
+            **self.as_lists(),
         }
+
+    def as_lists(self) -> dict[str, Any]:
+        """Gains and offsets of each view and channel, as JSON can hold them."""
+        return {"gains": self.gains.tolist(), "offsets": self.offsets.tolist()}
 
 
 def compensate_exposure(views: "ViewBatch", mode: ExposureMode) -> "tuple[ViewBatch, Exposure]":

@@ -130,7 +130,7 @@ class CaptureEvaluator:
                     case = images.case(triple.context, [target], self.predictor.depth_range)
                     pairs[target] = self._triple(case, None).targets[0].scores
             case = images.case(context, targets, self.predictor.depth_range)
-            result.cases[count] = [self._window(capture, case, pairs, show)]
+            result.cases[count] = [self._window(case, pairs, show)]
         return result
 
     def predict(self, case: EvalCase) -> Scene:
@@ -156,7 +156,7 @@ class CaptureEvaluator:
         rendering = render_target(scene.gaussians, case.targets, 0)
         nearest = case.context.image(nearest_view(case.context, pose))
         scores = {
-            MODEL: self._measure_scene(scene, rendering.rgb, [0, 1], truth, valid),
+            MODEL: self._measure_scene(scene, rendering.rgb, case, 0),
             NEAREST: self._measure(nearest, truth, valid),
             ORACLE_PLANE: self._measure(plane, truth, valid),
         }
@@ -165,26 +165,27 @@ class CaptureEvaluator:
         targets = [TargetScores(case.targets.names[0], scores)]
         return CaseScores(case.context.names, targets, _input_psnr(scene.gaussians, case), scene.seconds)
 
-    def _window(self, capture: Capture, case: EvalCase, pairs: dict[str, Scores], show: Show | None) -> CaseScores:
+    def _window(self, case: EvalCase, pairs: dict[str, Scores], show: Show | None) -> CaseScores:
         """Evaluate several views and the held-out frames between them; pairs: each frame's scores from two views."""
         scene = self.predict(case)
         targets = []
         for index, name in enumerate(case.targets.names):
             truth, valid = case.targets.image(index), case.targets.valid[index]
             rendering = render_target(scene.gaussians, case.targets, index)
-            beside = [case.context.names.index(view) for view in capture.neighbours(name).context]
-            scores = {MODEL: self._measure_scene(scene, rendering.rgb, beside, truth, valid), PAIRS: pairs[name][MODEL]}
+            scores = {MODEL: self._measure_scene(scene, rendering.rgb, case, index), PAIRS: pairs[name][MODEL]}
             scores |= {method: pairs[name][method] for method in (NEAREST, ORACLE_PLANE)}
             targets.append(TargetScores(name, scores))
             if show is not None:
                 show(_strip_name(case, index), comparison_strip(truth, valid, rendering, None))
         return CaseScores(case.context.names, targets, _input_psnr(scene.gaussians, case), scene.seconds)
 
-    def _measure_scene(
-        self, scene: Scene, image: np.ndarray, beside: Sequence[int], truth: np.ndarray, valid: np.ndarray
-    ) -> dict[str, float]:
-        """The metrics of a render between two context views, and its PSNR in their mean exposure."""
-        interpolated = scene.in_exposure_of(image, beside)
+    def _measure_scene(self, scene: Scene, image: np.ndarray, case: EvalCase, index: int) -> dict[str, float]:
+        """The metrics of a render, and its PSNR in the mean exposure of the context views around.
+
+        The held-out frame `index` lies between the context views `index` and `index + 1`.
+        """
+        truth, valid = case.targets.image(index), case.targets.valid[index]
+        interpolated = scene.in_exposure_of(image, [index, index + 1])
         return self._measure(image, truth, valid) | {INTERPOLATED: psnr(interpolated, truth, valid)}
 
     def _measure(self, image: np.ndarray, truth: np.ndarray, valid: np.ndarray) -> dict[str, float]:
