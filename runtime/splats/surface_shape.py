@@ -12,7 +12,8 @@ which moves nothing across the rays: its image in its own view stays, and a ball
 What other views see through keeps its shape, as wrong surfaces should not hide right ones.
 
 Where two views show one surface, their nearly opaque Gaussians compete: the layer that is nearer by a hair hides the
-other. With less opacity their colours mix.
+other. With less opacity their colours mix. They also sample it twice as densely as one view does, so that smaller ones
+close it as well, and mix less of what their depths make disagree.
 """
 
 from dataclasses import replace
@@ -25,15 +26,18 @@ from .gaussians import Gaussians
 from .merging import covariances, ellipsoids
 from .surfaces import Surfaces, project_to_pixel
 
-SHARED_OPACITY = 0.75  # of its own, for a Gaussian of a surface that another view shows, too
+MIN_SMALLER_VIEWS = 3  # the network was trained to predict Gaussians of two views that mix
+# What a Gaussian of a surface that another view shows, too, keeps of its opacity and its scales.
+SHARED_OPACITY, SHARED_SCALE = 0.75, 1.0
+SMALLER_OPACITY, SMALLER_SCALE = 0.9, 0.75  # with MIN_SMALLER_VIEWS
 
 
 def fit_to_surface(gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarray, view: int) -> Gaussians:
     """The Gaussians of a view, one for each pixel, in shapes that close the surface.
 
     Those of surfaces that no more neighbours contradict than confirm are sheared along their rays, except where a
-    neighbour has denser samples of the surface. Those that a neighbour confirms are less opaque. kept: the pixels whose
-    Gaussians are kept, bool [views, height, width].
+    neighbour has denser samples of the surface. Those that a neighbour confirms are less opaque and, with
+    MIN_SMALLER_VIEWS, smaller. kept: the pixels whose Gaussians are kept, bool [views, height, width].
     """
     spacings, (stretched, shared) = surfaces.spacings, np.zeros((2, *kept[view].shape), bool)
     _ask_neighbors(
@@ -44,7 +48,11 @@ def fit_to_surface(gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarray, v
     shear = _shears(surfaces, view, members)
     scales, quats = gaussians.scales.copy(), gaussians.quats.copy()
     scales[members], quats[members] = ellipsoids(shear @ covariances(gaussians, members) @ shear.swapaxes(1, 2))
-    opacities = gaussians.opacities * np.where(shared.ravel(), np.float32(SHARED_OPACITY), np.float32(1))
+    smaller = len(kept) >= MIN_SMALLER_VIEWS
+    opacity, scale = (SMALLER_OPACITY, SMALLER_SCALE) if smaller else (SHARED_OPACITY, SHARED_SCALE)
+    opacities = gaussians.opacities.copy()
+    opacities[shared.ravel()] *= np.float32(opacity)
+    scales[shared.ravel()] *= np.float32(scale)
     return replace(gaussians, scales=scales, quats=quats, opacities=opacities)
 
 

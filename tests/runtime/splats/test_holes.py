@@ -204,6 +204,17 @@ def test_views_of_one_surface_mix() -> None:
     assert abs(shown[1] - middle) < 0.95 * abs(shown[0] - middle)
 
 
+@pytest.mark.parametrize("pose", [np.eye(4), orbiting(45), approached()], ids=["frontal", "from aside", "from near"])
+def test_smaller_gaussians_of_two_views_close_a_plane(pose: np.ndarray) -> None:
+    """Of three views of a plane two copies are kept: as much smaller as they may be, no camera sees between them."""
+    before, surfaces = pixel_sized(np.concatenate([slanted(0)[None]] * 3), shifted(-0.1, 0.1, 0))
+    kept = np.ones((3, SIZE, SIZE), bool)
+    kept[2] = False
+    after = close_surfaces(before, surfaces, kept)
+    assert np.median(after.scales) < np.median(before.scales)
+    assert least_alpha(after, pose) > 0.95
+
+
 @pytest.mark.parametrize("second", [None, 20 * DISTANCE], ids=["one view", "another view sees through it"])
 def test_a_surface_of_one_view_stays_opaque(second: float | None) -> None:
     views = 1 if second is None else 2
