@@ -124,16 +124,23 @@ def start_worker(settings: Settings, threads: int) -> "Worker":
 
 
 def record_killed(scene: Scene, settings: Settings) -> Outcome:
-    """The failure of a scene whose worker was killed twice; written down where the disk or the store takes it."""
+    """The failure of a scene whose worker was killed twice; written down where the disk or the store takes it.
+
+    What the worker had written by then is removed; older results stay, if it had not begun to replace them.
+    """
     place = join(settings.out, scene.id)
     record = {"id": scene.id, "status": Status.FAILED, "error": KILLED, "hash": None, "seconds": None}
     try:
         results = open_results(place)
-        record["hash"] = (read_record(results) or {}).get("hash")
+        before = read_record(results) or {}
+        record["hash"] = before.get("hash")
+        if before.get("status") == Status.STARTED:
+            for name in (splats_name(settings.splat_format), PICTURE):
+                results.remove(name)
         if isinstance(place, Path):
             outputs().writes("", [place / RECORD], known=True)
         write_record(results, record)
-    except InputError as error:
+    except (InputError, OSError) as error:
         LOG.warning("%s", error)
     return Outcome(record, True)
 

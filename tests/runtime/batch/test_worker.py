@@ -5,11 +5,11 @@ import shutil
 
 import pytest
 from idesplat.runtime.batch.inputs import LocalInputs
-from idesplat.runtime.batch.records import fingerprint, model_sha256, read_record
+from idesplat.runtime.batch.records import fingerprint, model_sha256, read_record, write_record
 from idesplat.runtime.batch.results import LocalResults
 from idesplat.runtime.batch.run import batch
 from idesplat.runtime.batch.scenes import Scene
-from idesplat.runtime.batch.worker import Settings, Worker
+from idesplat.runtime.batch.worker import Settings, Worker, record_killed
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.inference.metadata import StageFile, write_manifest
 from idesplat.runtime.inference.model_files import read_model
@@ -47,6 +47,18 @@ def test_a_failure_that_cannot_be_written_is_returned(worker, own, tmp_path):
     assert tried
     assert record["status"] == "failed"
     assert "cannot create the folder" in record["error"]
+
+
+@pytest.mark.parametrize("began", [True, False])
+def test_what_a_killed_worker_wrote_is_removed_and_results_before_it_stay(worker, own, tmp_path, began):
+    """The kill may come when the splats are there and the record is not yet."""
+    record = worker.run(own).record
+    results = LocalResults(tmp_path / "out" / "a")
+    if began:
+        write_record(results, {"id": "a", "hash": record["hash"], "status": "started"})
+    assert record_killed(own, worker.settings).record["status"] == "failed"
+    assert read_record(results)["hash"] == record["hash"]
+    assert [results.exists(name) for name in ("scene.ply", "picture.jpg")] == [not began] * 2
 
 
 def test_a_failure_stands_until_the_inputs_change(worker, own, tmp_path):
