@@ -1,5 +1,6 @@
 """IDESplat's encoder: CNN and matching features, and a monocular branch with its relative disparity."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 from torch import Tensor
@@ -30,6 +31,8 @@ class Encoder(ViewEncoder):
 
     def __init__(self, config: IDESplatConfig) -> None:
         super().__init__(config)
+        # Replaced in training, where the views can be of several scenes.
+        self.nearest_views: Callable[[Tensor, int], Tensor] = nearest_views
         self.photo = PhotoBranch(config.photo) if config.photo is not None else None
         if self.photo is None:
             self.vit = DinoV2(config.vit)
@@ -37,7 +40,7 @@ class Encoder(ViewEncoder):
 
     def forward(self, images: Tensor, extrinsics: Tensor) -> EncoderFeatures:
         """Images [views, 3, H, W] in [0, 1], extrinsics [views, 4, 4] -> the encoder's features."""
-        neighbours = nearest_views(extrinsics, self.neighbours)
+        neighbours = self.nearest_views(extrinsics, self.neighbours)
         normalised = normalize_images(images)
         cnn, cnn_fine, _ = self.backbone(normalised)
         mv = self.transformer(cnn, neighbours)

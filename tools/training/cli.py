@@ -101,6 +101,13 @@ def train(
     device: Annotated[
         Device, typer.Option(help="Where the network is trained. The CPU renders scenes and Gaussians in any case.")
     ] = Device.CPU,
+    together: Annotated[
+        int,
+        typer.Option(help="Scenes of two views that the network takes at once; more make a GPU faster.", min=1),
+    ] = 1,
+    loaders: Annotated[
+        int, typer.Option(help="Processes that render scenes, if one process trains; 0 for a thread.", min=0)
+    ] = 0,
     save_every: Annotated[float, typer.Option(help="Minutes between checkpoints.", min=0)] = 3.0,
     validate_every: Annotated[int, typer.Option(help="Steps between validations.", min=1)] = 200,
     overwrite: Overwrite = False,
@@ -159,6 +166,8 @@ def train(
             processes=processes,
             threads=threads,
             device=device.value,
+            together=together,
+            loaders=loaders,
             save_every=save_every * SECONDS_PER_MINUTE,
             validate_every=validate_every,
             on_start=warn_without_lpips,

@@ -1,22 +1,24 @@
 """Gather attention of epipolar layers for training; it stores no gathered features.
 
-On a CPU the sums are compiled with numba, elsewhere they are the network's own, in larger chunks.
+On a CPU the sums are compiled with numba. On a GPU the rows of a pixel's candidates are a bag of `embedding_bag`, whose
+kernels sum them without storing them, and the gradient of the table is a kernel of numba's.
 """
 
 from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from ...model.common import gather_attention as networks
 from ...model.common.gather_attention import GatherAttention
 from ...model.idesplat.network import IDESplat
 from ...runtime.system.compilation import compiled
 
-# The type of device that the sums are compiled for. Elsewhere so many candidates are gathered at a time, which bounds
-# memory to this many copies of the features.
-COMPILED_FOR, CHUNK = "cpu", 32
+# The type of device that has compiled sums of its own here.
+CPU = "cpu"
+# `embedding_bag`'s number of the mode that sums.
+SUM_MODE = 0
 
 _compiled = compiled(fastmath={"contract", "arcp", "nsz", "reassoc"})
 
@@ -69,8 +71,8 @@ def gathered_weighted_sum(probability: Tensor, table: Tensor, rows: Tensor) -> T
 
 def _dot(pixels: Tensor, table: Tensor, rows: Tensor) -> Tensor:
     """out[p, c, i] = pixels[p, i] . table[rows[p, c, i]]."""
-    if pixels.device.type != COMPILED_FOR:
-        return networks.gathered_dot(pixels, table, rows, CHUNK)
+    if pixels.device.type != CPU:
+        return bag_dot(pixels, table, rows)
     out = torch.empty(rows.shape, dtype=pixels.dtype)
     _compiled_dot(pixels.numpy(), table.numpy(), rows.numpy(), out.numpy())
     return out
@@ -78,8 +80,8 @@ def _dot(pixels: Tensor, table: Tensor, rows: Tensor) -> Tensor:
 
 def _weighted_sum(weights: Tensor, table: Tensor, rows: Tensor) -> Tensor:
     """out[p, i] = sum over c of weights[p, c, i] * table[rows[p, c, i]]."""
-    if weights.device.type != COMPILED_FOR:
-        return networks.gathered_weighted_sum(weights, table, rows, CHUNK)
+    if weights.device.type != CPU:
+        return bag_weighted_sum(weights, table, rows)
     out = table.new_zeros(rows.shape[0], rows.shape[2], table.shape[1])
     _compiled_weighted_sum(weights.numpy(), table.numpy(), rows.numpy(), out.numpy())
     return out
@@ -88,12 +90,36 @@ def _weighted_sum(weights: Tensor, table: Tensor, rows: Tensor) -> Tensor:
 def _scatter_add(weights: Tensor, pixels: Tensor, table: Tensor, rows: Tensor) -> Tensor:
     """The gradient of the table: out[rows[p, c, i]] += weights[p, c, i] * pixels[p, i]."""
     out = torch.zeros_like(table)
-    if weights.device.type == COMPILED_FOR:
-        _compiled_scatter_add(weights.numpy(), pixels.numpy(), rows.numpy(), out.numpy())
+    if weights.device.type != CPU:
+        from .cuda_scatter import scatter_add
+
+        scatter_add(_by_pixel(weights), pixels.flatten(0, 1), _by_pixel(rows), out)
         return out
-    for some_weights, some_rows in zip(weights.split(CHUNK, dim=1), rows.split(CHUNK, dim=1), strict=True):
-        out.index_add_(0, some_rows.flatten(), (some_weights[..., None] * pixels[:, None]).flatten(0, 2))
+    _compiled_scatter_add(weights.numpy(), pixels.numpy(), rows.numpy(), out.numpy())
     return out
+
+
+def bag_dot(pixels: Tensor, table: Tensor, rows: Tensor) -> Tensor:
+    """As `_dot`, by the function that gives `embedding_bag` the gradient of its weights."""
+    pairs, candidates, count = rows.shape
+    bags = _by_pixel(rows)
+    number = torch.arange(len(bags), dtype=rows.dtype, device=rows.device)
+    dot = torch.ops.aten._embedding_bag_per_sample_weights_backward(
+        *(pixels.flatten(0, 1), table, bags.flatten(), number * candidates),
+        *(number.repeat_interleave(candidates), SUM_MODE),
+    )
+    return dot.reshape(pairs, count, candidates).transpose(1, 2).contiguous()
+
+
+def bag_weighted_sum(weights: Tensor, table: Tensor, rows: Tensor) -> Tensor:
+    """As `_weighted_sum`, by `embedding_bag`."""
+    total = F.embedding_bag(_by_pixel(rows), table, mode="sum", per_sample_weights=_by_pixel(weights))
+    return total.reshape(rows.shape[0], rows.shape[2], table.shape[1])
+
+
+def _by_pixel(of_candidates: Tensor) -> Tensor:
+    """[pairs, candidates, h * w] -> [pairs * h * w, candidates]."""
+    return of_candidates.transpose(1, 2).flatten(0, 1).contiguous()
 
 
 @_compiled

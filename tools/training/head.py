@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -38,6 +39,8 @@ SCALE_GAIN = 1.1
 HALVED = ("features", "context")
 # Number of scenes over which opacities are averaged.
 RESET_SCENES = 4
+# Parts of a sample that the loss of the head does not use.
+UNUSED = ("inverse_depth", "pointmap", "scenes", "matches")
 
 
 @dataclass(frozen=True)
@@ -157,7 +160,8 @@ def _packed(sample: HeadSample) -> dict[str, Tensor]:
     views = {field.name: getattr(sample.views, field.name) for field in fields(TrainingViews)}
     for name in ("images", "target_images"):
         views[name] = (views[name] * 255).round().to(torch.uint8)
-    del views["inverse_depth"], views["pointmap"]  # the head's loss does not use them
+    for name in UNUSED:
+        del views[name]
     inputs = sample.inputs._asdict()
     return {**views, **{name: value.half() if name.startswith(HALVED) else value for name, value in inputs.items()}}
 
@@ -166,7 +170,7 @@ def _unhalved(value: Tensor) -> Tensor:
     return value.float() if value.dtype == torch.float16 else value
 
 
-def _unpacked(packed: dict[str, Tensor]) -> HeadSample:
+def _unpacked(packed: dict[str, Any]) -> HeadSample:
     inputs = HeadInputs(**{name: _unhalved(packed.pop(name)) for name in HeadInputs._fields})
     for name in ("images", "target_images"):
         packed[name] = packed[name].float() / 255

@@ -73,14 +73,15 @@ def inverse_depth_loss(predicted: Tensor, truth: Tensor, spacing: Tensor) -> Ten
     return loss
 
 
-def candidate_cross_entropy(probability: Tensor, candidates: Tensor, truth: Tensor) -> Tensor:
+def candidate_cross_entropy(probability: Tensor, candidates: Tensor, truth: Tensor, scenes: int = 1) -> Tensor:
     """Cross entropy between candidate probabilities and the true inverse depth.
 
     The target distribution interpolates linearly between the two candidates around the truth; its mean is the truth.
-    Pixels whose truth lies outside the candidates are left out.
+    Pixels whose truth lies outside the candidates are left out. The mean over pixels is that of each scene, of which
+    the loss is the mean.
 
     probability, candidates: [n, candidates, h, w]; candidates are inverse depths, uniformly spaced.
-    truth: inverse depth, [n, 1, h, w].
+    truth: inverse depth, [n, 1, h, w]. scenes: how many the n maps are of, each with as many.
     """
     low = candidates[:, :1]
     step = candidates[:, 1:2] - low
@@ -92,10 +93,13 @@ def candidate_cross_entropy(probability: Tensor, candidates: Tensor, truth: Tens
     index = below.long()
     log = probability.clamp(min=EPS).log()
     entropy = -(1 - upper) * log.gather(1, index) - upper * log.gather(1, index + 1)
-    return (entropy * inside).sum() / inside.sum().clamp(min=1)
+    entropy, inside = (entropy * inside).reshape(scenes, -1), inside.reshape(scenes, -1)
+    return (entropy.sum(1) / inside.sum(1).clamp(min=1)).mean()
 
 
-def dpbu_loss(output: DPBUOutput, scores: tuple[Tensor, Tensor], inverse_depth: Tensor, spacing: Tensor) -> Tensor:
+def dpbu_loss(
+    output: DPBUOutput, scores: tuple[Tensor, Tensor], inverse_depth: Tensor, spacing: Tensor, scenes: int = 1
+) -> Tensor:
     """Loss of one depth probability boosting unit (DPBU): both layers' depth, and cross entropies.
 
     The correlations of both layers are supervised directly, too: without this, features learn to match much later,
@@ -104,23 +108,25 @@ def dpbu_loss(output: DPBUOutput, scores: tuple[Tensor, Tensor], inverse_depth: 
 
     scores: correlations of the two layers before their U-Nets, each [views * neighbours, candidates, h, w].
     inverse_depth: the truth, [views, H, W]. spacing: of the candidates of DPBU 1, [views, 1, 1, 1].
+    scenes: how many the views are of.
     """
     truth = resize_truth(inverse_depth, *output.inverse_depth.shape[2:])
     loss = inverse_depth_loss(output.inverse_depth, truth, spacing)
-    loss = loss + ENTROPY_WEIGHT * candidate_cross_entropy(output.probability, output.candidates, truth)
+    loss = loss + ENTROPY_WEIGHT * candidate_cross_entropy(output.probability, output.candidates, truth, scenes)
     loss = loss + FIRST_LAYER_WEIGHT * inverse_depth_loss(output.inverse_depth_first, truth, spacing)
     neighbours = scores[0].shape[0] // truth.shape[0]
     candidates, truth = repeat_views(output.candidates, neighbours), repeat_views(truth, neighbours)
     for layer in scores:
-        loss = loss + MATCHING_WEIGHT * candidate_cross_entropy(layer.softmax(1), candidates, truth)
+        loss = loss + MATCHING_WEIGHT * candidate_cross_entropy(layer.softmax(1), candidates, truth, scenes)
     return loss
 
 
-def monocular_loss(encoded: EncoderFeatures, inverse_depth: Tensor) -> Tensor:
-    """Scale-invariant L1 of the monocular disparity d: r(|d / mean(d) - D* / mean(D*)|), means over all views."""
+def monocular_loss(encoded: EncoderFeatures, inverse_depth: Tensor, scenes: int = 1) -> Tensor:
+    """Scale-invariant L1 of the monocular disparity d: r(|d / mean(d) - D* / mean(D*)|), means over a scene's views."""
     disparity = encoded.mono_disparity
-    truth = resize_truth(inverse_depth, *disparity.shape[2:])
-    error = (disparity / disparity.mean().clamp(min=EPS) - truth / truth.mean()).abs()
+    truth = resize_truth(inverse_depth, *disparity.shape[2:]).reshape(scenes, -1)
+    disparity = disparity.reshape(scenes, -1)
+    error = (disparity / disparity.mean(1, keepdim=True).clamp(min=EPS) - truth / truth.mean(1, keepdim=True)).abs()
     return MONOCULAR_WEIGHT * robust_error(error, 1.0).mean()
 
 

@@ -18,6 +18,7 @@ from ...model.common.sh import SH_0, sh_basis
 from ...runtime.geometry.projection import DISC_STD, EPS2D, FOV_MARGIN
 from ...runtime.rendering.types import MAX_ALPHA, MIN_ALPHA
 from ...runtime.system.compilation import compiled
+from ...runtime.system.threads import map_in_threads
 
 NEAR = 0.01  # scene units
 MIN_TRANSMITTANCE = 1e-4
@@ -47,6 +48,39 @@ def rasterize(
     depth: sum of z-depth with the weights of colour, not divided by alpha. All tensors have one float type and device.
     aperture: diameter of a thin lens in world units, 0 for a pinhole. focus: z-depth of its plane in focus.
     """
+    gaussians = (means, quats, scales, opacities, sh)
+    splats = _splats(gaussians, viewmat, K, width, height, aperture, focus)
+    image, transmittance = (part[0] for part in _Composite.apply(width, height, *splats))
+    return image[..., :3] + transmittance[..., None] * background, 1 - transmittance, image[..., 3]
+
+
+def render_images(scenes: Sequence[Sequence[Tensor]], viewmats: Tensor, Ks: Tensor, width: int, height: int) -> Tensor:
+    """Images on black, [images, height, width, 3], composited side by side in threads.
+
+    scenes: for each image its Gaussians (means, scales, quats, opacities, sh). viewmats: [images, 4, 4].
+    Ks: [images, 3, 3]. Units and frames as of `rasterize`.
+    """
+    splats: list[Tensor] = []
+    for (means, scales, quats, opacities, sh), viewmat, K in zip(scenes, viewmats, Ks, strict=True):
+        splats += _splats((means, quats, scales, opacities, sh), viewmat, K, width, height)
+    images: Tensor = _Composite.apply(width, height, *splats)[0]
+    return images[..., :3]
+
+
+def _splats(
+    gaussians: tuple[Tensor, Tensor, Tensor, Tensor, Tensor],
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    aperture: float = 0.0,
+    focus: float = 1.0,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """What is composited: centres and conics in pixels, opacities, and colours with z-depth, as of `_Composite`.
+
+    gaussians: means, quats, scales, opacities, sh; all arguments as of `rasterize`.
+    """
+    means, quats, scales, opacities, sh = gaussians
     camera_means = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     seen = torch.nonzero(camera_means.detach()[:, 2] > NEAR)[:, 0]
     if len(seen) < len(means):
@@ -59,8 +93,7 @@ def rasterize(
     conics = _conics(covariances)
     colours = _colours(sh, means, -viewmat[:3, :3].T @ viewmat[:3, 3])
     values = torch.cat([colours, camera_means[:, 2:]], dim=-1)  # [gaussians, 4]
-    image, transmittance = _Composite.apply(centres, conics, opacities, values, width, height)
-    return image[..., :3] + transmittance[..., None] * background, 1 - transmittance, image[..., 3]
+    return centres, conics, opacities, values
 
 
 def render_on_black(
@@ -143,34 +176,66 @@ def _colours(sh: Tensor, means: Tensor, camera: Tensor) -> Tensor:
 
 
 class _Composite(torch.autograd.Function):
-    """Front-to-back compositing of splats: values [height, width, 4] and final transmittance [height, width]."""
+    """Front-to-back compositing of the splats of some images.
+
+    Returns values [images, height, width, 4] and the final transmittance [images, height, width].
+    """
 
     @staticmethod
-    def forward(
-        ctx: Any, centres: Tensor, conics: Tensor, opacities: Tensor, values: Tensor, width: int, height: int
-    ) -> tuple[Tensor, Tensor]:
-        """centres [splats, 2], conics [splats, 3], opacities [splats], values [splats, 4]: colour and z-depth."""
-        parts = (centres, conics, opacities, values)
-        xy, q, o, v = (np.ascontiguousarray(part.detach().cpu().numpy()) for part in parts)
-        order = np.argsort(v[:, 3], kind="stable")
-        image = np.zeros((height, width, 4), v.dtype)
-        transmittance = np.ones((height, width), v.dtype)
-        last = np.full((height, width), -1)
-        _composite(xy, q, o, v, order, image, transmittance, last)
-        ctx.parts = (xy, q, o, v, order, transmittance, last)
-        return torch.from_numpy(image).to(centres.device), torch.from_numpy(transmittance).to(centres.device)
+    def forward(ctx: Any, width: int, height: int, *splats: Tensor) -> tuple[Tensor, Tensor]:
+        """splats: for each image centres [splats, 2], conics [splats, 3], opacities [splats] and values [splats, 4].
+
+        The values are colour and z-depth.
+        """
+        arrays = [np.ascontiguousarray(part.detach().cpu().numpy()) for part in splats]
+        ctx.images = [
+            _Image(*arrays[first : first + 4], width=width, height=height) for first in range(0, len(arrays), 4)
+        ]
+        map_in_threads(lambda index: ctx.images[index].composite(), len(ctx.images))
+        device = splats[0].device
+        values = np.stack([image.values for image in ctx.images])
+        transmittance = np.stack([image.transmittance for image in ctx.images])
+        return torch.from_numpy(values).to(device), torch.from_numpy(transmittance).to(device)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradients for centres, conics, opacities and values."""
-        for_image, for_transmittance = (np.ascontiguousarray(part.cpu().numpy()) for part in gradients)
-        xy, q, o, v, order, transmittance, last = ctx.parts
-        for_xy, for_q, for_o, for_v = np.zeros_like(xy), np.zeros_like(q), np.zeros_like(o), np.zeros_like(v)
-        _composite_backward(
-            xy, q, o, v, order, transmittance, last, for_image, for_transmittance, for_xy, for_q, for_o, for_v
+        """Gradients for centres, conics, opacities and values of each image."""
+        device = gradients[0].device
+        for_values, for_transmittance = (np.ascontiguousarray(part.cpu().numpy()) for part in gradients)
+        found = map_in_threads(
+            lambda index: ctx.images[index].gradients(for_values[index], for_transmittance[index]), len(ctx.images)
         )
-        found = (for_xy, for_q, for_o, for_v)
-        return *(torch.from_numpy(part).to(gradients[0].device) for part in found), None, None
+        return None, None, *(torch.from_numpy(part).to(device) for parts in found for part in parts)
+
+
+class _Image:
+    """An image that is composited, and what its gradients need."""
+
+    def __init__(self, *splats: np.ndarray, width: int, height: int) -> None:
+        """splats: centres, conics, opacities and values, as of `_Composite`."""
+        self.splats, values = splats, splats[3]
+        self.order = np.argsort(values[:, 3], kind="stable")
+        self.values = np.zeros((height, width, 4), values.dtype)
+        self.transmittance = np.ones((height, width), values.dtype)
+        self.last = np.full((height, width), -1)
+
+    def composite(self) -> None:
+        """Fill `values` and `transmittance`."""
+        centres, conics, opacities, values = self.splats
+        _composite(centres, conics, opacities, values, self.order, self.values, self.transmittance, self.last)
+
+    def gradients(self, for_values: np.ndarray, for_transmittance: np.ndarray) -> list[np.ndarray]:
+        """Gradients for centres, conics, opacities and values."""
+        centres, conics, opacities, values = self.splats
+        found = [np.zeros_like(part) for part in self.splats]
+        for_centres, for_conics, for_opacities, for_splats = found
+        _composite_backward(
+            *(centres, conics, opacities, values),
+            *(self.order, self.transmittance, self.last),
+            *(for_values, for_transmittance),
+            *(for_centres, for_conics, for_opacities, for_splats),
+        )
+        return found
 
 
 @_compiled

@@ -1,4 +1,4 @@
-"""One scene through the network as far as a phase trains it: predictions, loss and metrics."""
+"""Scenes through the network as far as a phase trains it: predictions, loss and metrics."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,7 +20,8 @@ from .objectives.defocus import defocus_loss
 from .objectives.pointmap import exact_pointmap, pointmap_loss
 from .options import NO_TERMS, Objective, OptionalTerms
 from .perceptual import Perceptual
-from .rasterizer import render_on_black
+from .rasterizer import render_images
+from .scene_batches import separate_scenes
 from .schedule import Phase
 
 # Weight of the photometric loss beside the offset prior.
@@ -71,22 +72,33 @@ def run_phase(model: IDESplat, views: TrainingViews, phase: Phase) -> PhaseOutpu
 
 
 def render_targets(gaussians: tuple[Tensor, ...], views: TrainingViews) -> Tensor:
-    """Gaussians (means, scales, quats, opacities, sh) seen by the target cameras, on black, [targets, 3, H, W]."""
+    """Gaussians (means, scales, quats, opacities, sh) seen by the target cameras, on black, [targets, 3, H, W].
+
+    Those of several scenes follow each other, as their target cameras do.
+    """
     height, width = views.target_images.shape[2:]
     Ks = denormalize_intrinsics(views.target_intrinsics, width, height)
     viewmats = invert_rigid(views.target_extrinsics)
-    images = [render_on_black(gaussians, viewmat, K, width, height)[0] for viewmat, K in zip(viewmats, Ks, strict=True)]
-    return torch.stack(images).permute(0, 3, 1, 2)
+    scenes = list(zip(*(part.chunk(views.scenes) for part in gaussians), strict=True))
+    targets = len(viewmats) // views.scenes
+    of_images = [scene for scene in scenes for _ in range(targets)]
+    return render_images(of_images, viewmats, Ks, width, height).permute(0, 3, 1, 2)
 
 
 def with_input_views(views: TrainingViews, first: int, count: int = 1) -> TrainingViews:
-    """The same views, with `count` of the context views appended to the targets: from `first` on, in a circle."""
-    chosen = [(first + place) % len(views.images) for place in range(count)]
+    """The same views, with `count` of each scene's context views as further targets: from `first` on, in a circle."""
+    context = len(views.images) // views.scenes
+    chosen = [(first + place) % context for place in range(count)]
+
+    def appended(targets: Tensor, inputs: Tensor) -> Tensor:
+        targets, inputs = (part.unflatten(0, (views.scenes, -1)) for part in (targets, inputs))
+        return torch.cat([targets, inputs[:, chosen]], dim=1).flatten(0, 1)
+
     return replace(
         views,
-        target_images=torch.cat([views.target_images, views.images[chosen]]),
-        target_extrinsics=torch.cat([views.target_extrinsics, views.extrinsics[chosen]]),
-        target_intrinsics=torch.cat([views.target_intrinsics, views.intrinsics[chosen]]),
+        target_images=appended(views.target_images, views.images),
+        target_extrinsics=appended(views.target_extrinsics, views.extrinsics),
+        target_intrinsics=appended(views.target_intrinsics, views.intrinsics),
     )
 
 
@@ -116,23 +128,23 @@ def scene_loss(
     step: int = 0,
     terms: OptionalTerms = NO_TERMS,
 ) -> tuple[Tensor, dict[str, float]]:
-    """The loss of a scene, and what is logged.
+    """The loss of a scene, or the mean loss of several, and what is logged.
 
     If target views are rendered, one context view is rendered, too, from the Gaussians of all views: that of number
     `step` modulo their count.
     """
     if phase.gaussians:
         views = with_input_views(views, step)
-    with record_correlations(model) as correlations:
+    with record_correlations(model) as correlations, separate_scenes(model, views.scenes):
         output = run_phase(model, views, phase)
     loss = torch.zeros((), device=views.images.device)
     entry = scene_metrics(output, views)
     if objective is not Objective.PHOTOMETRIC and views.inverse_depth is not None:
         spacing = candidate_spacing(model.config, views.near, views.far)
-        loss = loss + monocular_loss(output.encoded, views.inverse_depth)
+        loss = loss + monocular_loss(output.encoded, views.inverse_depth, views.scenes)
         for index, dpbu in enumerate(output.dpbus):
             scores = correlations[2 * index], correlations[2 * index + 1]
-            loss = loss + dpbu_loss(dpbu, scores, views.inverse_depth, spacing)
+            loss = loss + dpbu_loss(dpbu, scores, views.inverse_depth, spacing, views.scenes)
         if phase.dpbus == 3:
             loss = loss + inverse_depth_loss(output.inverse_depth, views.inverse_depth[:, None], spacing)
     if output.raw is not None and output.rendered is not None:
@@ -165,7 +177,7 @@ def rendering_loss(
 
 @torch.no_grad()
 def scene_metrics(output: PhaseOutput, views: TrainingViews) -> dict[str, float]:
-    """Depth: `abs_rel`, the mean of |D / D* - 1|, and `within`; rendered views: `psnr`.
+    """Depth: `abs_rel`, the mean of |D / D* - 1|, and `within`; rendered views: `psnr`, the mean of scenes.
 
     All pixels of the context views count, at the images' size, even those that one view alone sees. Captures have no
     true depth.
@@ -176,7 +188,8 @@ def scene_metrics(output: PhaseOutput, views: TrainingViews) -> dict[str, float]
         error = (views.inverse_depth / inverse_depth - 1).abs()
         entry = {"abs_rel": float(error.mean()), "within": float((error < WITHIN).float().mean())}
     if output.rendered is not None:
-        entry["psnr"] = psnr(output.rendered, views.target_images)
+        scenes = zip(output.rendered.chunk(views.scenes), views.target_images.chunk(views.scenes), strict=True)
+        entry["psnr"] = sum(psnr(rendered, truth) for rendered, truth in scenes) / views.scenes
     return entry
 
 

@@ -1,13 +1,13 @@
 """Training tasks: the full network, phase by phase, or the Gaussian head alone on cached features."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Generic, TypeVar
 
 from torch import Tensor
 
 from ...model.idesplat.network import IDESplat
-from .data.samples import SampleSpec, TrainingViews
+from .data.samples import SampleSpec, TrainingViews, stack_scenes
 from .data.synthetic import training_spec
 from .head import (
     HEAD_PREFIXES,
@@ -28,6 +28,9 @@ Source = Callable[[SampleSpec], TrainingViews]
 Sample = TypeVar("Sample")
 Losses = tuple[Tensor, dict[str, float]]
 
+# Pairs of views that a scene of two views matches: each view with the other.
+TWO_VIEW_PAIRS = 2
+
 
 class TrainingTask(ABC, Generic[Sample]):
     """The samples of a step, the loss of each, and which parameters are trained."""
@@ -44,9 +47,13 @@ class TrainingTask(ABC, Generic[Sample]):
     def load(self, spec: SampleSpec) -> Sample:
         """Load a sample; called in a background thread."""
 
+    def at_once(self, model: IDESplat, sample: Sample, phase: Phase) -> int:
+        """How many samples of a step, all with as many views as this one, `loss` takes at once."""
+        return 1
+
     @abstractmethod
-    def loss(self, model: IDESplat, sample: Sample, step: int, phase: Phase) -> Losses:
-        """The loss of a sample, and what is logged."""
+    def loss(self, model: IDESplat, samples: Sequence[Sample], step: int, phase: Phase) -> Losses:
+        """The mean loss of the samples, as many as `at_once` allows, and what is logged."""
 
     def prepare(self, model: IDESplat) -> None:
         """Adapt the weights that a new run starts from."""
@@ -65,8 +72,13 @@ class FullNetworkTask(TrainingTask[TrainingViews]):
         real_ratio: float,
         perceptual: Perceptual | None,
         terms: OptionalTerms = NO_TERMS,
+        together: int = 1,
     ) -> None:
-        """size: side of the images in the last phase, in pixels. real_ratio: probability of a capture."""
+        """size: side of the images in the last phase, in pixels. real_ratio: probability of a capture.
+
+        together: how many scenes of two views the network takes at once.
+        """
+        self.together = together
         self.phases, self.objective, self.perceptual, self.terms = phases, objective, perceptual, terms
         self.seed, self.size, self.source, self.real_ratio = seed, size, source, real_ratio
 
@@ -80,9 +92,17 @@ class FullNetworkTask(TrainingTask[TrainingViews]):
         """The views of a sample."""
         return self.source(spec)
 
-    def loss(self, model: IDESplat, sample: TrainingViews, step: int, phase: Phase) -> Losses:
+    def at_once(self, model: IDESplat, sample: TrainingViews, phase: Phase) -> int:
+        """Fewer scenes of more views: memory and time grow with the pairs of views that are matched."""
+        if self.terms.pm_loss or self.terms.aperture:
+            return 1  # these terms are of one scene
+        views = len(sample.images)
+        pairs = views * min(views - 1, model.config.neighbours)
+        return max(1, self.together * TWO_VIEW_PAIRS // pairs)
+
+    def loss(self, model: IDESplat, samples: Sequence[TrainingViews], step: int, phase: Phase) -> Losses:
         """As `scene_loss`, on the device of the network."""
-        views = sample.to(next(model.parameters()).device)
+        views = (stack_scenes(samples) if len(samples) > 1 else samples[0]).to(next(model.parameters()).device)
         return scene_loss(model, views, phase, self.objective, self.perceptual, step, self.terms)
 
 
@@ -115,9 +135,9 @@ class HeadTask(TrainingTask[HeadSample]):
         """The cached features of a sample."""
         return self.cache.load(spec)
 
-    def loss(self, model: IDESplat, sample: HeadSample, step: int, phase: Phase) -> Losses:
+    def loss(self, model: IDESplat, samples: Sequence[HeadSample], step: int, phase: Phase) -> Losses:
         """As `head_loss`."""
-        return head_loss(model, sample, step, self.perceptual)
+        return head_loss(model, samples[0], step, self.perceptual)
 
     def prepare(self, model: IDESplat) -> None:
         """Reset saturated opacities."""

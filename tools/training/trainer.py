@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +23,12 @@ from ...model.idesplat.network import IDESplat
 from ...runtime.errors import InputError
 from ..synthetic.photo_textures import photo_textures
 from .data.captures import CaptureScenes
-from .data.samples import SampleSpec, TrainingViews, prefetch
+from .data.samples import SampleSpec, TrainingViews, prefetch, prefetch_in_processes
 from .data.synthetic import generate_views
 from .head import FeatureCache
 from .log import TrainingLog, finite
 from .mixed_precision import with_bfloat16
+from .objectives.consistency import with_matches
 from .options import Objective, Part, PerceptualKind, Precision
 from .parallel import ProcessGroup, mean_entries, spawn_workers
 from .perceptual import EfficientNetDistance, Perceptual, load_lpips
@@ -58,6 +60,8 @@ def train(
     processes: int = 1,
     threads: int = 1,
     device: str = "cpu",
+    together: int = 1,
+    loaders: int = 0,
     save_every: float = 180.0,
     validate_every: int = 200,
     on_start: Callable[[], None] | None = None,
@@ -68,6 +72,8 @@ def train(
     config: the network's, if not that of the preset. features: folder of cached features, by default one inside `out`.
     processes: data-parallel processes, at most the batch size. threads: PyTorch's, in each process.
     device: where the network is trained, `cpu` or `cuda`; scenes are rendered and Gaussians composited on the CPU.
+    together: how many scenes of two views the network takes at once.
+    loaders: processes that render scenes, with one process that trains; 0 for a thread of each that trains.
     save_every: seconds between checkpoints. validate_every: steps between validations. on_start: called once weights
     and data are loaded. on_step: called after each step. LPIPS is left out where it is not installed.
 
@@ -77,10 +83,11 @@ def train(
     if processes > settings.batch:
         raise InputError(f"--processes {processes}: more than the {settings.batch} scenes of a step; raise --batch")
     _check_device(device, settings)
-    trainer = Trainer(out, settings, config, features, ProcessGroup(0, processes), threads, device)
+    _check_batches(settings, config, processes, together, loaders)
+    trainer = Trainer(out, settings, config, features, ProcessGroup(0, processes), threads, device, together, loaders)
     if on_start is not None:
         on_start()
-    with spawn_workers(processes, _work, out, settings, config, features, threads, device, validate_every):
+    with spawn_workers(processes, _work, out, settings, config, features, threads, device, together, validate_every):
         trainer.fit(save_every, validate_every, on_step)
 
 
@@ -92,10 +99,11 @@ def _work(
     features: Path | None,
     threads: int,
     device: str,
+    together: int,
     validate_every: int,
 ) -> None:
     """The loop of a process other than rank 0."""
-    Trainer(folder, settings, config, features, group, threads, device).fit(math.inf, validate_every)
+    Trainer(folder, settings, config, features, group, threads, device, together).fit(math.inf, validate_every)
 
 
 class Trainer:
@@ -110,11 +118,13 @@ class Trainer:
         group: ProcessGroup | None = None,
         threads: int = 1,
         device: str = "cpu",
+        together: int = 1,
+        loaders: int = 0,
     ) -> None:
         """Start the run, or resume it from the checkpoint in the folder; raises InputError if that is another run's.
 
         features: folder of cached features, by default one inside `folder`. group: the processes of the run.
-        threads: PyTorch's, in this process. device: where the network is trained.
+        threads: PyTorch's, in this process. device, together, loaders: as of `train`.
         """
         _prepare_process(threads)
         self.folder, self.settings, self.group = folder, settings, group or ProcessGroup()
@@ -127,7 +137,8 @@ class Trainer:
         elif settings.init:
             self.state.start_from(Path(settings.init))
         self.source, self.held_out = _sources(settings, config)
-        self.task = _task(settings, self.state.model, self.source, features or folder / FEATURES)
+        self.task = _task(settings, self.state.model, self.source, features or folder / FEATURES, together)
+        self.loaders = loaders
         self.phases = self.task.phases
         if not resumed:
             self.task.prepare(self.state.model)
@@ -139,7 +150,7 @@ class Trainer:
     def fit(self, save_every: float, validate_every: int, on_step: OnStep | None = None) -> None:
         """Train to the last step. save_every: seconds. validate_every: steps."""
         saved = time.monotonic()
-        samples = prefetch(self.specs(), self.task.load)
+        samples = self.samples()
         while self.state.step < self.settings.steps:
             entry = self.train_step(samples)
             if self.log is None:
@@ -152,7 +163,6 @@ class Trainer:
             if time.monotonic() - saved >= save_every:
                 self.save()
                 saved = time.monotonic()
-        samples.close()
         if self.group.is_main:
             self.save()
 
@@ -166,20 +176,35 @@ class Trainer:
             for slot in self.group.shard(self.settings.batch):
                 yield self.task.spec(step, slot, self.phase(step))
 
+    def samples(self) -> Iterator[Any]:
+        """This process's samples of all steps that are left, loaded ahead of their use."""
+        if self.loaders:
+            return prefetch_in_processes(list(self.specs()), self.source, self.loaders)
+        return prefetch(self.specs(), self.task.load)
+
     def train_step(self, samples: Iterator[Any]) -> dict[str, Any]:
         """Accumulate the gradients of a batch and make an optimiser step; returns what is logged."""
         started = time.monotonic()
         phase, batch = self.phase(self.state.step), self.settings.batch
         entries = []
-        for _ in self.group.shard(batch):
-            loss, entry = self.task.loss(self.state.model, next(samples), self.state.step, phase)
-            (loss / batch).backward()
-            entries.append(entry)
+        for part in self._parts(samples, phase):
+            loss, entry = self.task.loss(self.state.model, part, self.state.step, phase)
+            (loss * len(part) / batch).backward()
+            entries += [entry] * len(part)
         self.group.all_reduce_gradients(self.state.model.parameters())
         norm = self.state.update(lr_factor(self.phases, self.state.step, self.settings.steps))
         means = {name: finite(value) for name, value in mean_entries(self.group.gather(entries)).items()}
         seconds = round(time.monotonic() - started, 3)
         return {"step": self.state.step, **means, "gradient": finite(norm), "seconds": seconds}
+
+    def _parts(self, samples: Iterator[Any], phase: Phase) -> Iterator[list[Any]]:
+        """This process's samples of a step, as many at a time as the network takes at once."""
+        left = len(self.group.shard(self.settings.batch))
+        while left:
+            first = next(samples)
+            others = min(left, self.task.at_once(self.state.model, first, phase)) - 1
+            yield [first, *islice(samples, others)]
+            left -= 1 + others
 
     def validate(self, log: TrainingLog) -> dict[str, Any]:
         """Metrics of the EMA network on validation scenes at the phase's size; writes predictions and curves."""
@@ -196,6 +221,14 @@ class Trainer:
 
 def _sources(settings: TrainingSettings, config: IDESplatConfig) -> tuple[Source, Source]:
     """Loaders of the training and of the validation samples: synthetic scenes, captures, or both."""
+    if settings.consistency:
+        source, held_out = _scene_sources(settings, config)
+        return partial(with_matches, source), partial(with_matches, held_out)
+    return _scene_sources(settings, config)
+
+
+def _scene_sources(settings: TrainingSettings, config: IDESplatConfig) -> tuple[Source, Source]:
+    """`_sources` without matched points."""
     photos = Path(settings.textures) if settings.textures else None
     if photos is not None:
         photo_textures(photos)
@@ -206,13 +239,17 @@ def _sources(settings: TrainingSettings, config: IDESplatConfig) -> tuple[Source
     captures = CaptureScenes([Path(folder) for folder in settings.data], config.near, config.far, pointmaps)
     if settings.real_ratio == 1:
         return captures.load, captures.load_held_out
-    return (
-        lambda spec: captures.load(spec) if spec.real else synthetic(spec),
-        lambda spec: captures.load_held_out(spec) if spec.real else synthetic(spec),
-    )
+    return partial(_either, captures.load, synthetic), partial(_either, captures.load_held_out, synthetic)
 
 
-def _task(settings: TrainingSettings, model: IDESplat, source: Source, features: Path) -> TrainingTask[Any]:
+def _either(real: Source, synthetic: Source, spec: SampleSpec) -> TrainingViews:
+    """The views of a sample of either kind."""
+    return real(spec) if spec.real else synthetic(spec)
+
+
+def _task(
+    settings: TrainingSettings, model: IDESplat, source: Source, features: Path, together: int
+) -> TrainingTask[Any]:
     """The task that the settings describe. features: folder of cached features."""
     size, batch = settings.size, settings.batch
     perceptual = _perceptual(settings, next(model.parameters()).device) if settings.renders else None
@@ -222,7 +259,15 @@ def _task(settings: TrainingSettings, model: IDESplat, source: Source, features:
         return HeadTask(cache, settings.seed, size, batch, settings.scenes, settings.real_ratio, perceptual)
     objective = Objective(settings.objective)
     return FullNetworkTask(
-        settings.phases, objective, settings.seed, size, source, settings.real_ratio, perceptual, settings.terms
+        settings.phases,
+        objective,
+        settings.seed,
+        size,
+        source,
+        settings.real_ratio,
+        perceptual,
+        settings.terms,
+        together,
     )
 
 
@@ -246,6 +291,18 @@ def _check_device(device: str, settings: TrainingSettings) -> None:
         raise InputError(f"--device {device}: --train head runs on the CPU, with cached features; leave out --device")
     if not torch.cuda.is_available():
         raise InputError(f"--device {device}: PyTorch {torch.__version__} finds no such GPU; leave out --device")
+
+
+def _check_batches(
+    settings: TrainingSettings, config: IDESplatConfig, processes: int, together: int, loaders: int
+) -> None:
+    """Raise InputError where `together` or `loaders` cannot be used."""
+    if together > 1 and config.photo is None:
+        raise InputError(f"--together {together}: the ViT takes one scene at a time; leave out --together")
+    if loaders and processes > 1:
+        raise InputError(f"--loaders {loaders}: need a single process that trains; leave out --processes or --loaders")
+    if loaders and settings.part == Part.HEAD:
+        raise InputError(f"--loaders {loaders}: --train head has its scenes cached; leave out --loaders")
 
 
 def _prepare_process(threads: int) -> None:

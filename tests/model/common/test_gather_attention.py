@@ -3,7 +3,6 @@
 import numpy as np
 import onnx
 import onnxruntime
-import pytest
 import torch
 from idesplat.export.graph.gather_loops import FEW, chunked
 from idesplat.export.graph.subgraph import names_read
@@ -16,15 +15,16 @@ PAIRS, CANDIDATES, PIXELS, CHANNELS = 4, 11, 30, 6
 BLOCK = 8
 
 
-@pytest.mark.parametrize("by", ("numba", "torch"))  # as on a CPU, as on a GPU
-def test_values_and_gradients_are_the_networks_own(by: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    if by == "torch":
-        monkeypatch.setattr(training, "CHUNK", 4)  # fewer than CANDIDATES, and no divisor of them
-        monkeypatch.setattr(training, "COMPILED_FOR", "no device of this test")
+def random_tensors() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Queries, weights, a table and rows, some of them its last row of zeros."""
     torch.manual_seed(0)
-    rows = torch.randint(0, PAIRS * PIXELS + 1, (PAIRS, CANDIDATES, PIXELS))  # the last row is of zeros
+    rows = torch.randint(0, PAIRS * PIXELS + 1, (PAIRS, CANDIDATES, PIXELS), dtype=torch.int32)
     queries, weights = torch.randn(PAIRS, PIXELS, CHANNELS), torch.rand(PAIRS, CANDIDATES, PIXELS)
-    table = gathered.pixel_table(torch.randn(PAIRS, PIXELS, CHANNELS))
+    return queries, weights, gathered.pixel_table(torch.randn(PAIRS, PIXELS, CHANNELS)), rows
+
+
+def test_values_and_gradients_are_the_networks_own() -> None:
+    queries, weights, table, rows = random_tensors()
     for name, left in (("gathered_dot", queries), ("gathered_weighted_sum", weights)):
         results = []
         for module in (gathered, training):
@@ -34,6 +34,13 @@ def test_values_and_gradients_are_the_networks_own(by: str, monkeypatch: pytest.
             results.append((product, *gradients))
         for expected, found in zip(*results, strict=True):
             torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_sums_on_a_gpu_are_those_on_a_cpu() -> None:
+    queries, weights, table, rows = random_tensors()
+    torch.testing.assert_close(training.bag_dot(queries, table, rows), training.gathered_dot(queries, table, rows))
+    expected = training.gathered_weighted_sum(weights, table, rows)
+    torch.testing.assert_close(training.bag_weighted_sum(weights, table, rows), expected)
 
 
 def test_exported_values_are_the_networks_own() -> None:

@@ -23,7 +23,9 @@ from idesplat.tools.training.objectives.consistency import (
     RATIO_SCALE,
     RATIO_WEIGHT,
     consistency_loss,
+    match_views,
     matched_loss,
+    with_matches,
 )
 from idesplat.tools.training.objectives.defocus import (
     C1,
@@ -109,12 +111,12 @@ def test_consistency_by_hand() -> None:
 
 
 def test_true_depth_is_consistent_and_wrong_depth_is_not() -> None:
-    views = generate_views(SampleSpec(11, 2, (), 128, 128))
+    views = with_matches(generate_views, SampleSpec(11, 2, (), 128, 128))
     assert views.inverse_depth is not None
     true = 1 / views.inverse_depth
     assert float(consistency_loss(true, views)) < 0.5 * float(consistency_loss(1.25 * true, views))
-    blank = replace(views, images=torch.zeros_like(views.images))
-    assert float(consistency_loss(true, blank)) == 0  # no matches
+    assert match_views(replace(views, images=torch.zeros_like(views.images))) == ()
+    assert float(consistency_loss(true, replace(views, matches=((),)))) == 0
 
 
 def scene() -> list[torch.Tensor]:
@@ -222,7 +224,7 @@ def test_terms_without_effect_are_refused(changes: dict[str, object], expected: 
 
 def test_every_term_reaches_the_network(monkeypatch: pytest.MonkeyPatch) -> None:
     """The gradients of each term flow to depth, through the loss of a scene as a run computes it."""
-    views = generate_views(SampleSpec(11, 2, (1,), 64, 64))
+    views = with_matches(generate_views, SampleSpec(11, 2, (1,), 64, 64))
     assert views.inverse_depth is not None
     capture = replace(views, inverse_depth=None, pointmap=exact_pointmap(views))
     for terms, given in (

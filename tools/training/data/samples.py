@@ -1,18 +1,25 @@
 """A training sample: how it is specified, its tensors, and loading ahead of time."""
 
+import signal
 from collections import deque
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+from ....runtime.views.matching import PointMatches
+from ...processes import safe_path
 
 # Samples that are loaded ahead of their use.
 PREFETCHED = 4
 
 T = TypeVar("T")
+# Indices of two context views of a scene, and the points matched between them, for each pair.
+SceneMatches = tuple[tuple[int, int, PointMatches], ...]
 
 
 @dataclass(frozen=True)
@@ -49,10 +56,23 @@ class TrainingViews:
     # Of captures, where given: a point for each pixel of the context views, in a frame and a scale of its own, NaN
     # where unknown, [context * H * W, 3].
     pointmap: Tensor | None = None
+    # How many scenes the context views are of, each with as many; they follow each other (`stack_scenes`).
+    scenes: int = 1
+    # Of each scene the points matched between its context views, where they are used.
+    matches: tuple[SceneMatches, ...] | None = None
 
     def to(self, device: torch.device) -> "TrainingViews":
         """The same views on a device."""
-        return replace(self, **{name: part.to(device) for name, part in vars(self).items() if part is not None})
+        moved: dict[str, Any] = {name: part.to(device) for name, part in vars(self).items() if isinstance(part, Tensor)}
+        return replace(self, **moved)
+
+
+def stack_scenes(scenes: Sequence[TrainingViews]) -> TrainingViews:
+    """The views of synthetic scenes that have as many context views as each other, for one pass of the network."""
+    names = [name for name, part in vars(scenes[0]).items() if isinstance(part, Tensor)]
+    stacked: dict[str, Any] = {name: torch.cat([getattr(views, name) for views in scenes]) for name in names}
+    matches = tuple(of_scene for views in scenes for of_scene in views.matches or ())
+    return replace(scenes[0], **stacked, scenes=len(scenes), matches=matches or None)
 
 
 def prefetch(specs: Iterator[SampleSpec], load: Callable[[SampleSpec], T]) -> Generator[T]:
@@ -69,3 +89,40 @@ def prefetch(specs: Iterator[SampleSpec], load: Callable[[SampleSpec], T]) -> Ge
         finally:
             for future in pending:
                 future.cancel()
+
+
+def prefetch_in_processes(
+    specs: Sequence[SampleSpec], load: Callable[[SampleSpec], TrainingViews], processes: int
+) -> Iterator[TrainingViews]:
+    """The samples of `specs`, in that order, loaded by `processes` processes.
+
+    load: can be pickled.
+    """
+    loader = DataLoader(
+        _Samples(specs, load),
+        batch_size=None,
+        num_workers=processes,
+        prefetch_factor=PREFETCHED,
+        multiprocessing_context="spawn",
+        worker_init_fn=_ignore_interrupt,
+    )
+    with safe_path():
+        return iter(loader)
+
+
+class _Samples(Dataset[TrainingViews]):
+    """The samples of specifications, loaded when they are asked for."""
+
+    def __init__(self, specs: Sequence[SampleSpec], load: Callable[[SampleSpec], TrainingViews]) -> None:
+        self.specs, self.load = specs, load
+
+    def __len__(self) -> int:
+        return len(self.specs)
+
+    def __getitem__(self, index: int) -> TrainingViews:
+        return self.load(self.specs[index])
+
+
+def _ignore_interrupt(_: int) -> None:
+    """A terminal sends SIGINT to all processes; that which trains handles it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

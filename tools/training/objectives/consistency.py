@@ -10,7 +10,8 @@ For a point matched at pixel p of view i and q of view j, with the predicted dep
 Both go through r(e; c) = c log(1 + e / c) (`losses.robust_error`), since some matches are wrong.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable
+from dataclasses import replace
 from itertools import permutations
 
 import numpy as np
@@ -20,7 +21,7 @@ from torch import Tensor
 
 from ....runtime.sfm.features import triangulate
 from ....runtime.views.matching import PointMatches, ViewMatcher
-from ..data.samples import TrainingViews
+from ..data.samples import SampleSpec, SceneMatches, TrainingViews
 from ..losses import robust_error
 
 # Scales c: of distances in pixels, and of logarithms of depth ratios.
@@ -31,17 +32,39 @@ RATIO_WEIGHT = 10.0
 MIN_DEPTH = 1e-2
 
 
-def consistency_loss(depth: Tensor, views: TrainingViews) -> Tensor:
-    """Mean of both terms over the matches of all pairs of context views; 0 without matches.
+def with_matches(source: Callable[[SampleSpec], TrainingViews], spec: SampleSpec) -> TrainingViews:
+    """The views of a sample, with the points matched between them, which takes longer than the loss of these."""
+    views = source(spec)
+    return replace(views, matches=(match_views(views),))
 
-    depth: predicted z-depth of the context views, [context, H, W].
+
+def match_views(views: TrainingViews) -> SceneMatches:
+    """The matches of each ordered pair of a scene's context views that has any."""
+    arrays = (views.images, views.extrinsics, views.intrinsics)
+    images, extrinsics, intrinsics = (part.detach().cpu().numpy() for part in arrays)
+    matcher = ViewMatcher(images, extrinsics.astype(np.float64), intrinsics)
+    found = ((i, j, matcher.match(i, j)) for i, j in permutations(range(len(images)), 2))
+    return tuple((i, j, matches) for i, j, matches in found if len(matches.first))
+
+
+def consistency_loss(depth: Tensor, views: TrainingViews) -> Tensor:
+    """Mean of both terms over a scene's matches of all pairs of context views; 0 without matches; its mean over scenes.
+
+    depth: predicted z-depth of the context views, [context, H, W]. views: with their matches.
     """
-    losses = [
-        matched_loss(depth[i], depth[j], views.intrinsics[i], views.intrinsics[j], matches)
-        for i, j, matches in _matches(views)
-        if len(matches.first)
-    ]
-    return torch.cat(losses).mean() if losses else depth.sum() * 0
+    assert views.matches is not None
+    context = len(depth) // views.scenes
+    Ks = views.intrinsics
+    total = depth.sum() * 0
+    for scene, of_scene in enumerate(views.matches):
+        first = scene * context
+        losses = [
+            matched_loss(depth[first + i], depth[first + j], Ks[first + i], Ks[first + j], matches)
+            for i, j, matches in of_scene
+        ]
+        if losses:
+            total = total + torch.cat(losses).mean()
+    return total / views.scenes
 
 
 def matched_loss(
@@ -73,15 +96,6 @@ def matched_loss(
     distance = ((projected - second) * focal).norm(dim=1)
     ratio_error = ((at_first / at_second).log() - ratio).abs()
     return robust_error(distance, EPIPOLAR_SCALE) + RATIO_WEIGHT * robust_error(ratio_error, RATIO_SCALE)
-
-
-def _matches(views: TrainingViews) -> Iterator[tuple[int, int, PointMatches]]:
-    """The matches of each ordered pair of context views."""
-    arrays = (views.images, views.extrinsics, views.intrinsics)
-    images, extrinsics, intrinsics = (part.detach().cpu().numpy() for part in arrays)
-    matcher = ViewMatcher(images, extrinsics.astype(np.float64), intrinsics)
-    for i, j in permutations(range(len(images)), 2):
-        yield i, j, matcher.match(i, j)
 
 
 def _sample(depth: Tensor, points: Tensor, K: Tensor) -> Tensor:
