@@ -6,7 +6,7 @@ from ..system.threads import map_in_threads
 from .backdrop import make_backdrop
 from .background import continue_background
 from .gaussians import Gaussians
-from .surface_shape import fit_to_surface
+from .surface_shape import fit_to_surface, mix_views
 from .surfaces import Surfaces
 
 
@@ -24,12 +24,15 @@ def close_holes(gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarray) -> G
 def close_view(
     gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarray, view: int
 ) -> tuple[Gaussians, Gaussians, Gaussians]:
-    """Of one view, the kept Gaussians as `fit_to_surface` gives them, the continued background and the backdrop."""
+    """Of one view, the kept Gaussians in shapes that close the surface, the continued background and the backdrop.
+
+    The background that is continued is hidden in all views, so that its Gaussians are not shared.
+    """
     pixels = kept[view].size
     own = gaussians.select(np.arange(pixels * view, pixels * (view + 1)))
-    fitted = fit_to_surface(own, surfaces, kept, view)
+    fitted, shared = fit_to_surface(own, surfaces, kept, view)
     return (
-        fitted.select(kept[view].ravel()),
+        mix_views(fitted, shared, len(kept)).select(kept[view].ravel()),
         continue_background(fitted, surfaces, kept, view),
         make_backdrop(own, surfaces, kept, view),
     )

@@ -32,12 +32,14 @@ SHARED_OPACITY, SHARED_SCALE = 0.75, 1.0
 SMALLER_OPACITY, SMALLER_SCALE = 0.9, 0.75  # with MIN_SMALLER_VIEWS
 
 
-def fit_to_surface(gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarray, view: int) -> Gaussians:
-    """The Gaussians of a view, one for each pixel, in shapes that close the surface.
+def fit_to_surface(
+    gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarray, view: int
+) -> tuple[Gaussians, np.ndarray]:
+    """The Gaussians of a view, one for each pixel, in shapes that close the surface, and which are shared.
 
     Those of surfaces that no more neighbours contradict than confirm are sheared along their rays, except where a
-    neighbour has denser samples of the surface. Those that a neighbour confirms are less opaque and, with
-    MIN_SMALLER_VIEWS, smaller. kept: the pixels whose Gaussians are kept, bool [views, height, width].
+    neighbour has denser samples of the surface. Those that a neighbour confirms are shared, bool [height * width].
+    kept: the pixels whose Gaussians are kept, bool [views, height, width].
     """
     spacings, (stretched, shared) = surfaces.spacings, np.zeros((2, *kept[view].shape), bool)
     _ask_neighbors(
@@ -48,12 +50,17 @@ def fit_to_surface(gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarray, v
     shear = _shears(surfaces, view, members)
     scales, quats = gaussians.scales.copy(), gaussians.quats.copy()
     scales[members], quats[members] = ellipsoids(shear @ covariances(gaussians, members) @ shear.swapaxes(1, 2))
-    smaller = len(kept) >= MIN_SMALLER_VIEWS
+    return replace(gaussians, scales=scales, quats=quats), shared.ravel()
+
+
+def mix_views(gaussians: Gaussians, shared: np.ndarray, views: int) -> Gaussians:
+    """The Gaussians with the shared ones less opaque and, with MIN_SMALLER_VIEWS, smaller; shared: bool [gaussians]."""
+    smaller = views >= MIN_SMALLER_VIEWS
     opacity, scale = (SMALLER_OPACITY, SMALLER_SCALE) if smaller else (SHARED_OPACITY, SHARED_SCALE)
-    opacities = gaussians.opacities.copy()
-    opacities[shared.ravel()] *= np.float32(opacity)
-    scales[shared.ravel()] *= np.float32(scale)
-    return replace(gaussians, scales=scales, quats=quats, opacities=opacities)
+    scales, opacities = gaussians.scales.copy(), gaussians.opacities.copy()
+    opacities[shared] *= np.float32(opacity)
+    scales[shared] *= np.float32(scale)
+    return replace(gaussians, scales=scales, opacities=opacities)
 
 
 def _shears(surfaces: Surfaces, view: int, members: np.ndarray) -> np.ndarray:
