@@ -14,6 +14,7 @@ from torch import Tensor
 from ...model.common.gather_attention import GatherAttention
 from ...model.idesplat.network import IDESplat
 from ...runtime.system.compilation import compiled
+from .cuda_scatter import scatter_add
 
 # The type of device that has compiled sums of its own here.
 CPU = "cpu"
@@ -91,8 +92,6 @@ def _scatter_add(weights: Tensor, pixels: Tensor, table: Tensor, rows: Tensor) -
     """The gradient of the table: out[rows[p, c, i]] += weights[p, c, i] * pixels[p, i]."""
     out = torch.zeros_like(table)
     if weights.device.type != CPU:
-        from .cuda_scatter import scatter_add
-
         scatter_add(_by_pixel(weights), pixels.flatten(0, 1), _by_pixel(rows), out)
         return out
     _compiled_scatter_add(weights.numpy(), pixels.numpy(), rows.numpy(), out.numpy())
