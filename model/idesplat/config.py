@@ -8,7 +8,7 @@ from ..config import DPTConfig, EncoderConfig, UNetConfig
 
 @dataclass(frozen=True)
 class PhotoConfig:
-    """The monocular branch on the frozen features of EfficientNet-Lite0."""
+    """The monocular branch on the features of EfficientNet-Lite0."""
 
     # Channels of its pyramid, which is fused at a quarter of the image's size.
     features: int = 32

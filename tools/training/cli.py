@@ -66,7 +66,8 @@ def train(
     lr: Annotated[float, typer.Option(help="Highest learning rate.", min=0)] = 1e-3,
     vit_lr: Annotated[float, typer.Option(help="Highest learning rate of the ViT.", min=0)] = 5e-4,
     photo_lr: Annotated[
-        float, typer.Option(help="Highest learning rate of EfficientNet-Lite0; 0 leaves its ImageNet weights.", min=0)
+        float,
+        typer.Option(help="Highest learning rate of EfficientNet-Lite0; 0 leaves its weights as they are.", min=0),
     ] = 0.0,
     seed: Annotated[int, typer.Option(help="Random seed of weights and scenes.", min=0)] = 0,
     perceptual: Annotated[
