@@ -137,6 +137,8 @@ class Trainer:
         elif settings.init:
             self.state.start_from(Path(settings.init))
         self.source, self.held_out = _sources(settings, config)
+        if settings.consistency:
+            self.source = partial(with_matches, self.source)
         self.task = _task(settings, self.state.model, self.source, features or folder / FEATURES, together)
         self.loaders = loaders
         self.phases = self.task.phases
@@ -221,14 +223,6 @@ class Trainer:
 
 def _sources(settings: TrainingSettings, config: IDESplatConfig) -> tuple[Source, Source]:
     """Loaders of the training and of the validation samples: synthetic scenes, captures, or both."""
-    if settings.consistency:
-        source, held_out = _scene_sources(settings, config)
-        return partial(with_matches, source), partial(with_matches, held_out)
-    return _scene_sources(settings, config)
-
-
-def _scene_sources(settings: TrainingSettings, config: IDESplatConfig) -> tuple[Source, Source]:
-    """`_sources` without matched points."""
     photos = Path(settings.textures) if settings.textures else None
     if photos is not None:
         photo_textures(photos)

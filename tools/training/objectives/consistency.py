@@ -33,9 +33,12 @@ MIN_DEPTH = 1e-2
 
 
 def with_matches(source: Callable[[SampleSpec], TrainingViews], spec: SampleSpec) -> TrainingViews:
-    """The views of a sample, with the points matched between them, which takes longer than the loss of these."""
+    """The views of a sample; with the points matched between them, if it has target views to be rendered.
+
+    Matching takes longer than the loss, which is part of the loss of rendered views alone (`step.rendering_loss`).
+    """
     views = source(spec)
-    return replace(views, matches=(match_views(views),))
+    return replace(views, matches=(match_views(views),)) if spec.target_zooms else views
 
 
 def match_views(views: TrainingViews) -> SceneMatches:
