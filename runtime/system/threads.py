@@ -20,7 +20,7 @@ def thread_count() -> int:
     return min(os.cpu_count() or 1, *_LIMITS) if _LIMITS else os.cpu_count() or 1
 
 
-def map_in_threads(task: Callable[[int], Result], count: int) -> list[Result]:
-    """What a task gives for the numbers from 0 to `count` - 1, in their order."""
-    with ThreadPoolExecutor(min(count, thread_count())) as pool:
+def map_in_threads(task: Callable[[int], Result], count: int, threads: int | None = None) -> list[Result]:
+    """What a task gives for the numbers from 0 to `count` - 1, in their order. threads: by default `thread_count()`."""
+    with ThreadPoolExecutor(min(count, threads or thread_count())) as pool:
         return list(pool.map(task, range(count)))

@@ -14,7 +14,7 @@ from ...runtime.cli.terminal import run, say, warn
 from ...runtime.errors import InputError
 from ...runtime.images.sizes import parse_size
 from ...runtime.system.outputs import outputs
-from .options import Device, Objective, Part, PerceptualKind, Precision
+from .options import Device, Objective, Part, PerceptualKind, Precision, Resources
 from .run_files import CHECKPOINT, CURVES, LOG, PREDICTIONS
 
 SECONDS_PER_MINUTE = 60
@@ -97,7 +97,7 @@ def train(
     processes: Annotated[int, typer.Option(help="Data-parallel processes, at most --batch.", min=1)] = 1,
     threads: Annotated[
         int,
-        typer.Option(help="PyTorch threads per process. Generating scenes takes part of another.", min=1),
+        typer.Option(help="Threads per process. Generating scenes takes part of another.", min=1),
     ] = 1,
     device: Annotated[
         Device, typer.Option(help="Where the network is trained. The CPU renders scenes and Gaussians in any case.")
@@ -164,11 +164,7 @@ def train(
             out,
             config=config,
             features=features,
-            processes=processes,
-            threads=threads,
-            device=device.value,
-            together=together,
-            loaders=loaders,
+            resources=Resources(processes, threads, device, together, loaders),
             save_every=save_every * SECONDS_PER_MINUTE,
             validate_every=validate_every,
             on_start=warn_without_lpips,

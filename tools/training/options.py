@@ -42,6 +42,23 @@ class Device(StrEnum):
 
 
 @dataclass(frozen=True)
+class Resources:
+    """What a run is computed with. Its result depends on this by rounding alone, so that a resumed run may have others.
+
+    processes: data-parallel processes, at most the batch size. threads: of PyTorch and of compositing, in each process.
+    device: where the network is trained; scenes are rendered and Gaussians composited on the CPU in any case.
+    together: how many scenes of two views the network takes at once. loaders: processes that render scenes, with one
+    process that trains; 0 for a thread of each that trains.
+    """
+
+    processes: int = 1
+    threads: int = 1
+    device: Device = Device.CPU
+    together: int = 1
+    loaders: int = 0
+
+
+@dataclass(frozen=True)
 class OptionalTerms:
     """Terms of the loss that are left out where their value is 0.
 

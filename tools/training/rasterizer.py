@@ -55,7 +55,7 @@ def rasterize(
 
 
 def render_images(scenes: Sequence[Sequence[Tensor]], viewmats: Tensor, Ks: Tensor, width: int, height: int) -> Tensor:
-    """Images on black, [images, height, width, 3], composited side by side in threads.
+    """Images on black, [images, height, width, 3], composited side by side in PyTorch's number of threads.
 
     scenes: for each image its Gaussians (means, scales, quats, opacities, sh). viewmats: [images, 4, 4].
     Ks: [images, 3, 3]. Units and frames as of `rasterize`.
@@ -191,7 +191,7 @@ class _Composite(torch.autograd.Function):
         ctx.images = [
             _Image(*arrays[first : first + 4], width=width, height=height) for first in range(0, len(arrays), 4)
         ]
-        map_in_threads(lambda index: ctx.images[index].composite(), len(ctx.images))
+        map_in_threads(lambda index: ctx.images[index].composite(), len(ctx.images), torch.get_num_threads())
         device = splats[0].device
         values = np.stack([image.values for image in ctx.images])
         transmittance = np.stack([image.transmittance for image in ctx.images])
@@ -203,7 +203,9 @@ class _Composite(torch.autograd.Function):
         device = gradients[0].device
         for_values, for_transmittance = (np.ascontiguousarray(part.cpu().numpy()) for part in gradients)
         found = map_in_threads(
-            lambda index: ctx.images[index].gradients(for_values[index], for_transmittance[index]), len(ctx.images)
+            lambda index: ctx.images[index].gradients(for_values[index], for_transmittance[index]),
+            len(ctx.images),
+            torch.get_num_threads(),
         )
         return None, None, *(torch.from_numpy(part).to(device) for parts in found for part in parts)
 
@@ -214,7 +216,7 @@ class _Image:
     def __init__(self, *splats: np.ndarray, width: int, height: int) -> None:
         """splats: centres, conics, opacities and values, as of `_Composite`."""
         self.splats, values = splats, splats[3]
-        self.order = np.argsort(values[:, 3], kind="stable")
+        self.order = np.empty(0, np.int64)
         self.values = np.zeros((height, width, 4), values.dtype)
         self.transmittance = np.ones((height, width), values.dtype)
         self.last = np.full((height, width), -1)
@@ -222,6 +224,7 @@ class _Image:
     def composite(self) -> None:
         """Fill `values` and `transmittance`."""
         centres, conics, opacities, values = self.splats
+        self.order = np.argsort(values[:, 3], kind="stable")
         _composite(centres, conics, opacities, values, self.order, self.values, self.transmittance, self.last)
 
     def gradients(self, for_values: np.ndarray, for_transmittance: np.ndarray) -> list[np.ndarray]:

@@ -29,7 +29,7 @@ from .head import FeatureCache
 from .log import TrainingLog, finite
 from .mixed_precision import with_bfloat16
 from .objectives.consistency import with_matches
-from .options import Objective, Part, PerceptualKind, Precision
+from .options import Device, Objective, Part, PerceptualKind, Precision, Resources
 from .parallel import ProcessGroup, mean_entries, spawn_workers
 from .perceptual import EfficientNetDistance, Perceptual, load_lpips
 from .plots import write_curves
@@ -44,6 +44,7 @@ from .validation import validate
 OnStep = Callable[[dict[str, Any]], None]
 Source = Callable[[SampleSpec], TrainingViews]
 
+ONE_THREAD = Resources()
 PLOTTED = ("loss", "psnr", "input_psnr", "abs_rel", "validation_abs_rel", "validation_psnr", "gradient")
 # glibc returns the memory of every large tensor to the system, which clears it again on the next allocation. These
 # parameters of mallopt make it keep that memory.
@@ -57,11 +58,7 @@ def train(
     *,
     config: IDESplatConfig | None = None,
     features: Path | None = None,
-    processes: int = 1,
-    threads: int = 1,
-    device: str = "cpu",
-    together: int = 1,
-    loaders: int = 0,
+    resources: Resources = ONE_THREAD,
     save_every: float = 180.0,
     validate_every: int = 200,
     on_start: Callable[[], None] | None = None,
@@ -70,24 +67,18 @@ def train(
     """Train a network in the folder `out`, or resume the run whose checkpoint is there.
 
     config: the network's, if not that of the preset. features: folder of cached features, by default one inside `out`.
-    processes: data-parallel processes, at most the batch size. threads: PyTorch's, in each process.
-    device: where the network is trained, `cpu` or `cuda`; scenes are rendered and Gaussians composited on the CPU.
-    together: how many scenes of two views the network takes at once.
-    loaders: processes that render scenes, with one process that trains; 0 for a thread of each that trains.
     save_every: seconds between checkpoints. validate_every: steps between validations. on_start: called once weights
     and data are loaded. on_step: called after each step. LPIPS is left out where it is not installed.
 
     Raises InputError for settings that contradict each other, for a checkpoint of another run, and for unusable data.
     """
     config = config or network_config(settings)
-    if processes > settings.batch:
-        raise InputError(f"--processes {processes}: more than the {settings.batch} scenes of a step; raise --batch")
-    _check_device(device, settings)
-    _check_batches(settings, config, processes, together, loaders)
-    trainer = Trainer(out, settings, config, features, ProcessGroup(0, processes), threads, device, together, loaders)
+    _check_resources(resources, settings, config)
+    processes = resources.processes
+    trainer = Trainer(out, settings, config, features, ProcessGroup(0, processes), resources)
     if on_start is not None:
         on_start()
-    with spawn_workers(processes, _work, out, settings, config, features, threads, device, together, validate_every):
+    with spawn_workers(processes, _work, out, settings, config, features, resources, validate_every):
         trainer.fit(save_every, validate_every, on_step)
 
 
@@ -97,13 +88,11 @@ def _work(
     settings: TrainingSettings,
     config: IDESplatConfig,
     features: Path | None,
-    threads: int,
-    device: str,
-    together: int,
+    resources: Resources,
     validate_every: int,
 ) -> None:
     """The loop of a process other than rank 0."""
-    Trainer(folder, settings, config, features, group, threads, device, together).fit(math.inf, validate_every)
+    Trainer(folder, settings, config, features, group, resources).fit(math.inf, validate_every)
 
 
 class Trainer:
@@ -116,21 +105,17 @@ class Trainer:
         config: IDESplatConfig,
         features: Path | None = None,
         group: ProcessGroup | None = None,
-        threads: int = 1,
-        device: str = "cpu",
-        together: int = 1,
-        loaders: int = 0,
+        resources: Resources = ONE_THREAD,
     ) -> None:
         """Start the run, or resume it from the checkpoint in the folder; raises InputError if that is another run's.
 
         features: folder of cached features, by default one inside `folder`. group: the processes of the run.
-        threads: PyTorch's, in this process. device, together, loaders: as of `train`.
         """
-        _prepare_process(threads)
+        _prepare_process(resources.threads)
         self.folder, self.settings, self.group = folder, settings, group or ProcessGroup()
         trained = HeadTask.trained if settings.part == Part.HEAD else FullNetworkTask.trained
         rates = settings.lr, settings.vit_lr, settings.photo_lr
-        self.state = TrainingState(config, settings.seed, *rates, trained, device)
+        self.state = TrainingState(config, settings.seed, *rates, trained, resources.device)
         resumed = (folder / CHECKPOINT).exists()
         if resumed:
             self.state.resume(folder / CHECKPOINT, asdict(settings))
@@ -139,8 +124,8 @@ class Trainer:
         self.source, self.held_out = _sources(settings, config)
         if settings.consistency:
             self.source = partial(with_matches, self.source)
-        self.task = _task(settings, self.state.model, self.source, features or folder / FEATURES, together)
-        self.loaders = loaders
+        self.task = _task(settings, self.state.model, self.source, features or folder / FEATURES, resources.together)
+        self.loaders = resources.loaders
         self.phases = self.task.phases
         if not resumed:
             self.task.prepare(self.state.model)
@@ -277,25 +262,21 @@ def _perceptual(settings: TrainingSettings, device: torch.device) -> Perceptual 
         return None
 
 
-def _check_device(device: str, settings: TrainingSettings) -> None:
-    """Raise InputError for a device that is not there, or not for what is trained."""
-    if device == "cpu":
-        return
-    if settings.part == Part.HEAD:
+def _check_resources(resources: Resources, settings: TrainingSettings, config: IDESplatConfig) -> None:
+    """Raise InputError for resources that are not there, or that what is trained cannot use."""
+    processes, device, loaders = resources.processes, resources.device, resources.loaders
+    head = settings.part == Part.HEAD
+    if processes > settings.batch:
+        raise InputError(f"--processes {processes}: more than the {settings.batch} scenes of a step; raise --batch")
+    if device is not Device.CPU and head:
         raise InputError(f"--device {device}: --train head runs on the CPU, with cached features; leave out --device")
-    if not torch.cuda.is_available():
+    if device is not Device.CPU and not torch.cuda.is_available():
         raise InputError(f"--device {device}: PyTorch {torch.__version__} finds no such GPU; leave out --device")
-
-
-def _check_batches(
-    settings: TrainingSettings, config: IDESplatConfig, processes: int, together: int, loaders: int
-) -> None:
-    """Raise InputError where `together` or `loaders` cannot be used."""
-    if together > 1 and config.photo is None:
-        raise InputError(f"--together {together}: the ViT takes one scene at a time; leave out --together")
+    if resources.together > 1 and config.photo is None:
+        raise InputError(f"--together {resources.together}: the ViT takes one scene at a time; leave out --together")
     if loaders and processes > 1:
         raise InputError(f"--loaders {loaders}: need a single process that trains; leave out --processes or --loaders")
-    if loaders and settings.part == Part.HEAD:
+    if loaders and head:
         raise InputError(f"--loaders {loaders}: --train head has its scenes cached; leave out --loaders")
 
 

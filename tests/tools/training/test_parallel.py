@@ -13,6 +13,7 @@ import pytest
 import torch
 from idesplat.runtime.errors import InputError
 from idesplat.tools.training import cli
+from idesplat.tools.training.options import Resources
 from idesplat.tools.training.parallel import ProcessGroup, mean_entries
 from idesplat.tools.training.run_files import CHECKPOINT, LOG
 from idesplat.tools.training.trainer import train
@@ -25,7 +26,7 @@ TWO_STEPS = replace(SETTINGS, curriculum=False, steps=2, batch=2)
 
 def trained(folder: Path, processes: int) -> tuple[dict[str, torch.Tensor], list[dict[str, float]]]:
     folder.mkdir()
-    train(TWO_STEPS, folder, config=SMALL, processes=processes, save_every=1e9, validate_every=10)
+    train(TWO_STEPS, folder, config=SMALL, resources=Resources(processes=processes), save_every=1e9, validate_every=10)
     entries = [json.loads(line) for line in (folder / LOG).read_text().splitlines()]
     return torch.load(folder / CHECKPOINT, weights_only=True)["training"]["weights"], entries
 

@@ -17,7 +17,7 @@ from idesplat.tools.training.data.samples import SampleSpec, prefetch, prefetch_
 from idesplat.tools.training.data.synthetic import generate_views
 from idesplat.tools.training.gather_attention import use_training_gather_attention
 from idesplat.tools.training.objectives.consistency import with_matches
-from idesplat.tools.training.options import Objective, OptionalTerms
+from idesplat.tools.training.options import Objective, OptionalTerms, Resources
 from idesplat.tools.training.run_files import CHECKPOINT
 from idesplat.tools.training.schedule import Phase
 from idesplat.tools.training.step import scene_loss
@@ -96,7 +96,7 @@ def test_run_with_loaders_ends_at_the_same_weights(tmp_path: Path) -> None:
     for loaders in (0, 1):
         folder = tmp_path / str(loaders)
         folder.mkdir()
-        train(settings, folder, config=SMALL, loaders=loaders, save_every=1e9, validate_every=10)
+        train(settings, folder, config=SMALL, resources=Resources(loaders=loaders), save_every=1e9, validate_every=10)
         weights.append(torch.load(folder / CHECKPOINT, weights_only=True)["state_dict"])
     assert all(torch.equal(value, weights[1][name]) for name, value in weights[0].items())
 
@@ -110,4 +110,4 @@ def test_run_with_loaders_ends_at_the_same_weights(tmp_path: Path) -> None:
 )
 def test_options_that_cannot_be_used_are_refused(tmp_path: Path, options: dict[str, int], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        train(replace(SETTINGS, batch=2), tmp_path, config=SMALL, **options)
+        train(replace(SETTINGS, batch=2), tmp_path, config=SMALL, resources=Resources(**options))
