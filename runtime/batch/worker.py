@@ -135,14 +135,19 @@ def record_killed(scene: Scene, settings: Settings) -> Outcome:
         before = read_record(results) or {}
         record["hash"] = before.get("hash")
         if before.get("status") == Status.STARTED:
-            for name in (splats_name(settings.splat_format), PICTURE):
-                results.remove(name)
+            _remove_written(results, settings)
         if isinstance(place, Path):
             outputs().writes("", [place / RECORD], known=True)
         write_record(results, record)
     except (InputError, OSError) as error:
         LOG.warning("%s", error)
     return Outcome(record, True)
+
+
+def _remove_written(results: Results, settings: Settings) -> None:
+    """Remove what a scene that failed had written."""
+    for name in (splats_name(settings.splat_format), PICTURE):
+        results.remove(name)
 
 
 @dataclass
@@ -188,6 +193,8 @@ class Worker:
             record |= {"hash": made_from, "seconds": time.perf_counter() - started, "peak_memory": peak_bytes()}
             write_record(results, record)
         except Exception as error:  # one scene's failure must not end the others
+            with suppress(InputError, OSError):
+                _remove_written(results, self.settings)
             record = self._fail(scene, made_from, error, started)
         return Outcome(record, True)
 

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import pytest
 from idesplat.runtime.batch.inputs import LocalInputs
@@ -59,6 +60,15 @@ def test_what_a_killed_worker_wrote_is_removed_and_results_before_it_stay(worker
     assert record_killed(own, worker.settings).record["status"] == "failed"
     assert read_record(results)["hash"] == record["hash"]
     assert [results.exists(name) for name in ("scene.ply", "picture.jpg")] == [not began] * 2
+
+
+def test_splats_do_not_stand_beside_the_record_of_a_failure(worker, own, tmp_path):
+    """The splats are there when the picture cannot be written: a folder stands in its place."""
+    (tmp_path / "out" / "a" / "picture.jpg").mkdir(parents=True)
+    record, _ = Worker(replace(worker.settings, overwrite=True)).run(own)
+    assert record["status"] == "failed"
+    assert "picture.jpg" in record["error"]
+    assert not (tmp_path / "out" / "a" / "scene.ply").exists()
 
 
 def test_a_failure_stands_until_the_inputs_change(worker, own, tmp_path):
