@@ -7,7 +7,7 @@ from idesplat.model.checkpoint import load_checkpoint
 from idesplat.runtime.inference.bundled_model import bundled_model
 from idesplat.runtime.inference.predictor import Predictor
 from idesplat.tools.synthetic.sampler import VALIDATION_SEEDS, generate_sample
-from idesplat.tools.training.release import WEIGHTS
+from idesplat.tools.training.release import WEIGHTS, mean_weights
 
 SIDE = 64
 TYPICAL = 1e-5  # median error that float32 explains
@@ -25,3 +25,11 @@ def test_the_bundled_graph_computes_what_its_weights_do() -> None:
     assert np.median(np.abs(found.depth / expected.depth.numpy() - 1)) < TYPICAL
     opacities = expected.gaussians.opacities.numpy().ravel()
     assert np.median(np.abs(found.need_gaussians().opacities - opacities)) < TYPICAL
+
+
+def test_networks_are_averaged_tensor_by_tensor() -> None:
+    networks = [{"weight": torch.tensor([1.0, 2.0]), "bias": torch.tensor(3.0)}]
+    networks += [{"weight": torch.tensor([3.0, -2.0]), "bias": torch.tensor(6.0)}]
+    assert mean_weights(networks[:1])["weight"].tolist() == [1, 2]
+    mean = mean_weights(networks)
+    assert (mean["weight"].tolist(), mean["bias"].item()) == ([2, 0], 4.5)
