@@ -134,8 +134,7 @@ def record_killed(scene: Scene, settings: Settings) -> Outcome:
         results = open_results(place)
         before = read_record(results) or {}
         record["hash"] = before.get("hash")
-        if before.get("status") == Status.STARTED:
-            _remove_written(results, settings)
+        _remove_started(results, before, settings)
         if isinstance(place, Path):
             outputs().writes("", [place / RECORD], known=True)
         write_record(results, record)
@@ -144,10 +143,11 @@ def record_killed(scene: Scene, settings: Settings) -> Outcome:
     return Outcome(record, True)
 
 
-def _remove_written(results: Results, settings: Settings) -> None:
-    """Remove what a scene that failed had written."""
-    for name in (splats_name(settings.splat_format), PICTURE):
-        results.remove(name)
+def _remove_started(results: Results, record: Mapping[str, Any], settings: Settings) -> None:
+    """Remove what was written of a scene whose record says that it was started and no more."""
+    if record.get("status") == Status.STARTED:
+        for name in (splats_name(settings.splat_format), PICTURE):
+            results.remove(name)
 
 
 @dataclass
@@ -194,7 +194,7 @@ class Worker:
             write_record(results, record)
         except Exception as error:  # one scene's failure must not end the others
             with suppress(InputError, OSError):
-                _remove_written(results, self.settings)
+                _remove_started(results, read_record(results) or {}, self.settings)
             record = self._fail(scene, made_from, error, started)
         return Outcome(record, True)
 

@@ -71,6 +71,16 @@ def test_splats_do_not_stand_beside_the_record_of_a_failure(worker, own, tmp_pat
     assert not (tmp_path / "out" / "a" / "scene.ply").exists()
 
 
+def test_older_splats_stay_where_the_start_cannot_be_written(worker, own, tmp_path):
+    """A folder stands in the record's place, as on a disk that is full."""
+    folder = tmp_path / "out" / "a"
+    (folder / "record.json" / "x").mkdir(parents=True)
+    (folder / "scene.ply").write_text("older")
+    record, _ = Worker(replace(worker.settings, overwrite=True)).run(own)
+    assert record["status"] == "failed"
+    assert (folder / "scene.ply").read_text() == "older"
+
+
 def test_a_failure_stands_until_the_inputs_change(worker, own, tmp_path):
     cameras = own.images / "transforms.json"
     good = cameras.read_text()
