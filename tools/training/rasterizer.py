@@ -188,10 +188,11 @@ class _Composite(torch.autograd.Function):
         The values are colour and z-depth.
         """
         arrays = [np.ascontiguousarray(part.detach().cpu().numpy()) for part in splats]
-        ctx.images = [
-            _Image(*arrays[first : first + 4], width=width, height=height) for first in range(0, len(arrays), 4)
-        ]
-        map_in_threads(lambda index: ctx.images[index].composite(), len(ctx.images), torch.get_num_threads())
+        ctx.images = map_in_threads(
+            lambda index: _Image(*arrays[4 * index : 4 * index + 4], width=width, height=height),
+            len(arrays) // 4,
+            torch.get_num_threads(),
+        )
         device = splats[0].device
         values = np.stack([image.values for image in ctx.images])
         transmittance = np.stack([image.transmittance for image in ctx.images])
@@ -211,20 +212,16 @@ class _Composite(torch.autograd.Function):
 
 
 class _Image:
-    """An image that is composited, and what its gradients need."""
+    """An image composited, and what its gradients need."""
 
     def __init__(self, *splats: np.ndarray, width: int, height: int) -> None:
         """splats: centres, conics, opacities and values, as of `_Composite`."""
-        self.splats, values = splats, splats[3]
-        self.order = np.empty(0, np.int64)
+        self.splats = splats
+        centres, conics, opacities, values = splats
+        self.order = np.argsort(values[:, 3], kind="stable")
         self.values = np.zeros((height, width, 4), values.dtype)
         self.transmittance = np.ones((height, width), values.dtype)
         self.last = np.full((height, width), -1)
-
-    def composite(self) -> None:
-        """Fill `values` and `transmittance`."""
-        centres, conics, opacities, values = self.splats
-        self.order = np.argsort(values[:, 3], kind="stable")
         _composite(centres, conics, opacities, values, self.order, self.values, self.transmittance, self.last)
 
     def gradients(self, for_values: np.ndarray, for_transmittance: np.ndarray) -> list[np.ndarray]:

@@ -2,7 +2,7 @@
 
     python -P -m idesplat.tools.training.release runs/head/last.ckpt
 
-Runs that start from one another may be averaged: the mean of their weights errs less than each.
+Runs that start from one another may be averaged; whether that is better than each of them, an evaluation tells.
 
 The verified ONNX graph goes to `runtime/inference/bundled/`, with its checksum. It is one for the web, which is as fast
 elsewhere, so that the page of `idesplat web` can run it on WebGPU. The weights go to `bundled.safetensors` beside this
