@@ -1,9 +1,9 @@
 """A differentiable rasteriser of Gaussians for training, with gsplat's semantics and gradients for all inputs.
 
-Projection (`geometry.projection`) and spherical harmonics (`geometry.sh`) are in PyTorch. Compositing (`rendering.types`) is in
-`fragments` on a GPU, and compiled with numba on a CPU: splats are visited front to back, and each is composited over
-the pixels of its bounding box. The backward pass visits them back to front. Nothing is stored per fragment: with T the
-transmittance behind a splat, that before it is T / (1 - alpha).
+Projection (`geometry.projection`) and spherical harmonics (`geometry.sh`) are in PyTorch, compositing
+(`rendering.types`) is compiled with numba for the CPU, also where the tensors are on a GPU: splats are visited front to
+back, and each is composited over the pixels of its bounding box. The backward pass visits them back to front. Nothing
+is stored per fragment: with T the transmittance behind a splat, that before it is T / (1 - alpha).
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,6 @@ from ...runtime.geometry.projection import DISC_STD, EPS2D, FOV_MARGIN
 from ...runtime.rendering.types import MAX_ALPHA, MIN_ALPHA
 from ...runtime.system.compilation import compiled
 from ...runtime.system.threads import map_in_threads
-from .fragments import CompositeFragments
 
 NEAR = 0.01  # scene units
 MIN_TRANSMITTANCE = 1e-4
@@ -51,7 +50,7 @@ def rasterize(
     """
     gaussians = (means, quats, scales, opacities, sh)
     splats = _splats(gaussians, viewmat, K, width, height, aperture, focus)
-    image, transmittance = (part[0] for part in _composite_images(width, height, splats))
+    image, transmittance = (part[0] for part in _Composite.apply(width, height, *splats))
     return image[..., :3] + transmittance[..., None] * background, 1 - transmittance, image[..., 3]
 
 
@@ -64,7 +63,8 @@ def render_images(scenes: Sequence[Sequence[Tensor]], viewmats: Tensor, Ks: Tens
     splats: list[Tensor] = []
     for (means, scales, quats, opacities, sh), viewmat, K in zip(scenes, viewmats, Ks, strict=True):
         splats += _splats((means, quats, scales, opacities, sh), viewmat, K, width, height)
-    return _composite_images(width, height, splats)[0][..., :3]
+    images: Tensor = _Composite.apply(width, height, *splats)[0]
+    return images[..., :3]
 
 
 def _splats(
@@ -173,14 +173,6 @@ def _colours(sh: Tensor, means: Tensor, camera: Tensor) -> Tensor:
         return torch.clamp_min(SH_0 * sh[:, 0] + 0.5, 0)
     basis = sh_basis(torch.nn.functional.normalize(means - camera, dim=-1), count)
     return torch.clamp_min((basis[:, :, None] * sh).sum(dim=1) + 0.5, 0)
-
-
-def _composite_images(width: int, height: int, splats: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """As `_Composite`, which is for the CPU."""
-    if splats[0].is_cpu:
-        return _Composite.apply(width, height, *splats)
-    images = [CompositeFragments.apply(width, height, *splats[first : first + 4]) for first in range(0, len(splats), 4)]
-    return torch.stack([image for image, _ in images]), torch.stack([transmittance for _, transmittance in images])
 
 
 class _Composite(torch.autograd.Function):

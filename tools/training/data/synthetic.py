@@ -12,7 +12,7 @@ from ...synthetic.textures import Textures
 from .samples import SampleSpec, TrainingViews
 
 # Numbers of context views once there is more than one DPBU, and their probabilities. Six take 7 GB in training.
-VIEW_COUNT_PROBABILITIES = {2: 0.6, 3: 0.16, 4: 0.12, 6: 0.12}
+VIEW_COUNT_PROBABILITIES = {2: 0.87, 3: 0.08, 4: 0.05}
 # One target view has the size of the context images; another is a crop of an image up to so many times as large.
 # Gaussians that are only rendered at the context's size leave gaps where a viewer shows them larger.
 MAX_TARGET_ZOOM = 4
