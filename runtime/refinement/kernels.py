@@ -372,8 +372,14 @@ def adam_step(
     beta_1: float,
     beta_2: float,
     correction: float,  # one over the bias correction of the second moments
+    opacity_decay: float,
+    scale_growth: float,
 ) -> None:
-    """One step of Adam on the Gaussians that this view sees (selective Adam); no gradient is stored."""
+    """One step of Adam on the Gaussians that this view sees (selective Adam); no gradient is stored.
+
+    opacity_decay: times the gradient of the opacity, is subtracted from its logit. scale_growth: is added to the log
+    scales. Both are outside of Adam, as in AdamW (Loshchilov and Hutter 2019).
+    """
     camera, work, given = np.empty(3), np.empty((6, 3, 3)), np.empty(ENTRY)
     basis = np.empty((2, sh.shape[1]))
     gradient = np.empty(11 + 3 * sh.shape[1], np.float32)
@@ -392,10 +398,11 @@ def adam_step(
         _adam_direction(gradient, moments[index], beta_1, beta_2, correction)
         for axis in range(3):
             means[index, axis] -= lr[axis] * gradient[axis]
-            log_scales[index, axis] -= lr[7 + axis] * gradient[7 + axis]
+            log_scales[index, axis] -= lr[7 + axis] * gradient[7 + axis] - scale_growth
         for axis in range(4):
             quats[index, axis] -= lr[3 + axis] * gradient[3 + axis]
-        logits[index] -= lr[10] * gradient[10]
+        opacity = 1.0 / (1.0 + np.exp(-logits[index]))
+        logits[index] -= lr[10] * gradient[10] + opacity_decay * opacity * (1.0 - opacity)
         for coefficient in range(sh.shape[1]):
             for channel in range(3):
                 column = 11 + 3 * coefficient + channel

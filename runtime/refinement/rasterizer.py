@@ -232,8 +232,10 @@ class GradientRasterizer:
         moments: np.ndarray,
         lr: np.ndarray,
         count: int,
+        opacity_decay: float = 0.0,
+        scale_growth: float = 0.0,
     ) -> None:
-        """One step of Adam, the `count`-th (from 1), on the Gaussians that the pass saw."""
+        """One step of Adam, the `count`-th (from 1), on the Gaussians that the pass saw (`kernels.adam_step`)."""
         p, target = self.parameters, done.target
         rates, correction = (lr / (1 - BETA_1**count)).astype(np.float32), 1 / (1 - BETA_2**count)
 
@@ -241,7 +243,7 @@ class GradientRasterizer:
             kernels.adam_step(
                 p.means, p.quats, p.log_scales, p.logits, p.sh, target.viewmat, target.K, target.width, target.height,
                 start, stop, done.projected, done.boxes, done.offsets, gradients, moments, rates,
-                BETA_1, BETA_2, correction,
+                BETA_1, BETA_2, correction, opacity_decay, scale_growth,
             )  # fmt: skip
 
         self._over_gaussians(adam_step)

@@ -85,13 +85,15 @@ def refine(
     optimiser = Optimiser(gaussians, views, options)
     order = _view_order(len(views), options.seed)
     psnr: list[float] = []
-    prune_at = int(PRUNE_AFTER * options.steps) if options.max_gaussians else -1
+    pruned = not (options.max_gaussians or options.min_opacity)
     for step in progress(range(options.steps), "refining", detail=lambda: f"{psnr[-1]:.1f} dB" if psnr else ""):
         elapsed = (time.perf_counter() - started) / options.seconds
         if elapsed >= 1:
             break
-        if step == prune_at:
+        done = max(step / options.steps, elapsed)
+        if not pruned and done >= PRUNE_AFTER and step >= len(views):  # else no view may have shown what others need
             optimiser.prune(options.max_gaussians)
+            pruned = True
         lr = options.final_lr ** max(step / max(options.steps - 1, 1), elapsed)
         psnr.append(optimiser.step(next(order), lr))
         if report is not None and not report(step, psnr[-1]):
@@ -131,23 +133,32 @@ class Optimiser:
         self.steps += 1
         if self.options.lr_poses:
             self._step_pose(index, self.rasterizer.pose_gradient(done, gradients), lr)
-        self.rasterizer.step(done, gradients, self.moments, self.lr * lr, self.steps)
+        decay, growth = self.options.opacity_decay * lr, self.options.scale_growth * lr
+        self.rasterizer.step(done, gradients, self.moments, self.lr * lr, self.steps, decay, growth)
         self._step_exposure(index, loss.gradient, done.rgb, lr)
         return _psnr(rendered, view)
 
     def prune(self, limit: int) -> None:
-        """Keep the Gaussians that contribute most, at most `limit` or any number for 0; none that adds nothing."""
+        """Keep the Gaussians that contribute most, at most `limit` or any number for 0.
+
+        None that adds nothing, and none below the least opacity of the options.
+        """
         if not self.steps:
             for view in progress(self.views, "finding what contributes"):
                 done = self.rasterizer.forward(view.target)
                 self._add_contributions(done, self.rasterizer.backward(done, np.zeros_like(done.rgb)))
         total = self.contributions.total
-        chosen = strongest(total, limit or len(total))
+        chosen = strongest(np.where(self._faint(), 0, total), limit or len(total))
         if len(chosen) < len(total):
             self.parameters = self.parameters.select(chosen)
             self.moments = self.moments[chosen]
             self.contributions.keep(chosen)
             self.rasterizer = GradientRasterizer(self.parameters)
+
+    def _faint(self) -> np.ndarray:
+        """The Gaussians below the least opacity, bool [gaussians]; none, if all are."""
+        faint = _opacities(self.parameters) < self.options.min_opacity
+        return faint & (not faint.all())
 
     def _add_contributions(self, done: Pass, gradients: np.ndarray) -> None:
         self.contributions.add(self.rasterizer.weights(done, gradients), done.boxes[:, 3] > done.boxes[:, 2])
@@ -195,8 +206,11 @@ def _coarse(gaussians: Gaussians, views: Sequence[PosedImage]) -> np.ndarray:
 def _gaussians(parameters: Parameters) -> Gaussians:
     p = parameters
     quats = p.quats / np.maximum(np.linalg.norm(p.quats, axis=1, keepdims=True), 1e-12)
-    opacities = 1 / (1 + np.exp(-p.logits.astype(np.float64)))
-    return Gaussians(p.means, np.exp(p.log_scales), quats.astype(np.float32), opacities.astype(np.float32), p.sh)
+    return Gaussians(p.means, np.exp(p.log_scales), quats.astype(np.float32), _opacities(p).astype(np.float32), p.sh)
+
+
+def _opacities(parameters: Parameters) -> np.ndarray:
+    return 1 / (1 + np.exp(-parameters.logits.astype(np.float64)))
 
 
 def _median_depth(parameters: Parameters, views: Sequence[PosedImage]) -> float:
