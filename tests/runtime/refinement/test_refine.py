@@ -5,7 +5,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 from idesplat.runtime.refinement.rasterizer import GradientRasterizer, Parameters
-from idesplat.runtime.refinement.refine import PosedImage, RefinementOptions, refine
+from idesplat.runtime.refinement.refine import Optimiser, PosedImage, RefinementOptions, refine
 from idesplat.runtime.rendering.render import render_view
 from idesplat.runtime.splats.gaussians import Gaussians
 from scipy.spatial.transform import Rotation
@@ -136,6 +136,36 @@ def test_the_strongest_gaussians_are_kept(views: list[PosedImage]) -> None:
     refined = refine(both, views, options).gaussians
     assert 0 < len(refined) <= len(front)
     assert (refined.means[:, 2] < 6).mean() > 0.99
+
+
+def test_opacities_decay_and_scales_grow_where_a_view_sees_them(views: list[PosedImage]) -> None:
+    """By hand: at o = 0.5 the gradient of the opacity is o (1 - o) = 0.25, so 0.4 of it takes 0.1 from the logit 0."""
+    seen = replace(scene(0), opacities=np.full(400, 0.5, np.float32))
+    behind = replace(seen, means=-seen.means)
+    fixed = {f"lr_{name}": 0.0 for name in ("means", "scales", "quats", "opacities", "dc", "sh")}
+    options = RefinementOptions(steps=1, opacity_decay=0.4, scale_growth=0.05, **fixed)
+    refined = refine(Gaussians.concatenate([seen, behind]), views, options).gaussians
+    np.testing.assert_allclose(refined.opacities[400:], 0.5, atol=1e-6)
+    np.testing.assert_allclose(refined.scales[400:], 0.12, rtol=1e-6)
+    changed = np.abs(refined.opacities[:400] - 0.5) > 1e-6  # some lie outside of the one view that has its turn
+    assert changed.mean() > 0.3
+    np.testing.assert_allclose(refined.opacities[:400][changed], 1 / (1 + np.exp(0.1)), atol=1e-6)
+    np.testing.assert_allclose(refined.scales[:400][changed], 0.12 * np.exp(0.05), rtol=1e-5)
+
+
+def test_faint_gaussians_are_removed(views: list[PosedImage], monkeypatch: pytest.MonkeyPatch) -> None:
+    """After 60 % of the steps, and at the end; none where all are faint."""
+    at: list[int] = []
+    prune = Optimiser.prune
+    monkeypatch.setattr(Optimiser, "prune", lambda self, limit: (at.append(self.steps), prune(self, limit))[1])
+    opacities = np.where(np.arange(400) % 4 == 0, 0.02, 0.7).astype(np.float32)
+    options = RefinementOptions(steps=10, min_opacity=0.05, lr_opacities=0, lr_means=0)
+    kept = refine(replace(scene(0), opacities=opacities), views, options).gaussians
+    assert at == [6, 10]
+    assert 250 < len(kept) <= 300
+    assert kept.opacities.min() > 0.05
+    all_faint = replace(scene(0), opacities=np.full(400, 0.02, np.float32))
+    assert len(refine(all_faint, views, options).gaussians) > 300
 
 
 def test_gaussians_that_no_view_sees_stay(views: list[PosedImage], wrong_colours: Gaussians) -> None:
