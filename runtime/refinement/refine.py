@@ -21,7 +21,7 @@ from .view_adam import ViewAdam
 MAX_TRANSMITTANCE = 0.5  # of a pixel that counts as covered
 DEFAULT = RefinementOptions()
 COARSE = 3.0  # times the median size in the images, from where a Gaussian is one of a backdrop
-PRUNE_AFTER = 0.6  # of the steps, so that the others make up for what is removed
+PRUNE_AFTER = 0.6  # of the steps or the time, so that the others make up for what is removed
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +91,7 @@ def refine(
         if elapsed >= 1:
             break
         done = max(step / options.steps, elapsed)
-        if not pruned and done >= PRUNE_AFTER and step >= len(views):  # else no view may have shown what others need
+        if not pruned and done >= PRUNE_AFTER and step >= len(views):  # what no view shows yet, the next may need
             optimiser.prune(options.max_gaussians)
             pruned = True
         lr = options.final_lr ** max(step / max(options.steps - 1, 1), elapsed)
