@@ -11,6 +11,7 @@ PREDICTION_OPACITY, PREDICTION_SCALE = 0.2, 2.0
 # What their regularisation is, measured there, too: of the Gaussians that show one surface, those that the images need
 # less become transparent, and fewer, larger ones show it.
 PREDICTION_OPACITY_DECAY, PREDICTION_SCALE_GROWTH = 0.25, 0.005
+MOST_GROWTH = 1.0  # of the log scales in all steps, before it decays: many views have many steps
 
 # Fainter ones are removed: a seventh of them, without which held-out views are the same within 0.01 dB.
 PREDICTION_MIN_OPACITY = 0.05
@@ -66,6 +67,6 @@ def prediction_options(steps: int, **options: Any) -> RefinementOptions:
         max_opacity=PREDICTION_OPACITY,
         scale_factor=PREDICTION_SCALE,
         opacity_decay=PREDICTION_OPACITY_DECAY,
-        scale_growth=PREDICTION_SCALE_GROWTH,
+        scale_growth=min(PREDICTION_SCALE_GROWTH, MOST_GROWTH / steps),
         **options,
     )
