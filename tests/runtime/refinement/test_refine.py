@@ -4,6 +4,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from idesplat.runtime.refinement.options import prediction_options
 from idesplat.runtime.refinement.rasterizer import GradientRasterizer, Parameters
 from idesplat.runtime.refinement.refine import Optimiser, PosedImage, RefinementOptions, refine
 from idesplat.runtime.rendering.render import render_view
@@ -151,6 +152,11 @@ def test_opacities_decay_and_scales_grow_where_a_view_sees_them(views: list[Pose
     assert changed.mean() > 0.3
     np.testing.assert_allclose(refined.opacities[:400][changed], 1 / (1 + np.exp(0.1)), atol=1e-6)
     np.testing.assert_allclose(refined.scales[:400][changed], 0.12 * np.exp(0.05), rtol=1e-5)
+
+
+@pytest.mark.parametrize(("steps", "growth"), [(40, 0.005), (200, 0.005), (920, 1 / 920)])
+def test_scales_of_a_prediction_grow_by_e_at_most(steps: int, growth: float) -> None:
+    assert prediction_options(steps).scale_growth == pytest.approx(growth)
 
 
 def test_faint_gaussians_are_removed(views: list[PosedImage], monkeypatch: pytest.MonkeyPatch) -> None:
