@@ -401,7 +401,7 @@ def adam_step(
             log_scales[index, axis] -= lr[7 + axis] * gradient[7 + axis] - scale_growth
         for axis in range(4):
             quats[index, axis] -= lr[3 + axis] * gradient[3 + axis]
-        opacity = 1.0 / (1.0 + np.exp(-logits[index]))
+        opacity = np.float64(projected[index, OPACITY])
         logits[index] -= lr[10] * gradient[10] + opacity_decay * opacity * (1.0 - opacity)
         for coefficient in range(sh.shape[1]):
             for channel in range(3):
