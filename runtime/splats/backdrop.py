@@ -15,13 +15,15 @@ BEHIND = 0.04  # behind the farthest surface of a cell and those around it, rela
 SAME_SURFACE = 0.05  # pixels that give a cell its colour: relative difference in depth to the farthest
 STD = 0.6  # standard deviation, in cells
 OPACITY = 0.95
+MAGNIFIED = 5.0  # times nearer than its own view, from where a camera sees a cell as a large blot
 
 
 def make_backdrop(gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarray, view: int) -> Gaussians:
     """The layer of a view: a round Gaussian for each cell, with the farthest colour and depth around the cell.
 
     Beyond the frame, colour and depth are those of the nearest pixels inside. What another view sees before a surface
-    of its own is left out.
+    of its own is left out, and what a camera stands MAGNIFIED times nearer to than the view itself: from between the
+    cameras such a Gaussian covers much of the image.
 
     gaussians: one for each pixel of the view. kept: the pixels whose Gaussians are kept, bool [views, height, width].
     """
@@ -42,6 +44,7 @@ def make_backdrop(gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarray, vi
     points = (np.stack([x, y, np.ones_like(x)], axis=-1) * z[:, None]) @ pose[:3, :3].T + pose[:3, 3]
     hidden = np.zeros(len(points), bool)
     find_hidden(points, surfaces.neighbors[view], surfaces.depth, kept, surfaces.viewmats, surfaces.Ks, hidden)
+    hidden &= _nearest_camera(points, surfaces.extrinsics) > z / MAGNIFIED
 
     count = int(hidden.sum())
     scales = np.repeat((STD * CELL * z[hidden] / K[0, 0])[:, None], 3, axis=1)
@@ -50,6 +53,11 @@ def make_backdrop(gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarray, vi
     quats = np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1))
     opacities = np.full(count, OPACITY, np.float32)
     return Gaussians(points[hidden].astype(np.float32), scales.astype(np.float32), quats, opacities, sh)
+
+
+def _nearest_camera(points: np.ndarray, extrinsics: np.ndarray) -> np.ndarray:
+    """The distance of each point [points, 3] to the nearest camera, [points]."""
+    return np.linalg.norm(points[:, None] - extrinsics[:, :3, 3], axis=-1).min(axis=1)
 
 
 def _cells(values: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from idesplat.runtime.geometry.intrinsics import denormalize_intrinsics
 from idesplat.runtime.rendering.render import render_view
-from idesplat.runtime.splats.backdrop import BEHIND, CELL, MARGIN
+from idesplat.runtime.splats.backdrop import BEHIND, CELL, MAGNIFIED, MARGIN
 from idesplat.runtime.splats.gaussians import Gaussians
 from idesplat.runtime.splats.holes import close_holes, close_view
 from idesplat.runtime.splats.surfaces import Surfaces
@@ -192,6 +192,21 @@ def test_no_backdrop_where_another_view_looks_or_all_is_removed() -> None:
     kept[0] = False
     _, backdrop = with_backdrop(depth, shifted(0, 0), kept)
     assert (backdrop.means[:, 2] > 20 * DISTANCE).all()
+
+
+@pytest.mark.parametrize("distance", [0.5, 1.0])
+def test_no_backdrop_right_before_a_camera(distance: float) -> None:
+    """A camera behind a wall's backdrop that looks away from it; the cells farther than a fifth of the depth stay."""
+    wall = DISTANCE * (1 + BEHIND)
+    extrinsics = shifted(0, 0)
+    extrinsics[1, 2, 3] = wall + distance
+    _, backdrop = with_backdrop(np.stack([slanted(0)] * 2), extrinsics)
+    cells = (np.arange(-2, SIZE // CELL + 2) + 0.5) * CELL - SIZE / 2  # two more than the frame on each side
+    aside = np.hypot(*np.meshgrid(cells, cells)) * wall / K[0, 0]
+    expected = np.sort(aside[np.hypot(aside, distance) > wall / MAGNIFIED])
+    found = backdrop.means[np.isclose(backdrop.means[:, 2], wall)]
+    np.testing.assert_allclose(np.sort(np.hypot(found[:, 0], found[:, 1])), expected, rtol=1e-5)
+    assert (len(expected) < aside.size) == (distance < wall / MAGNIFIED)
 
 
 def test_views_of_one_surface_mix() -> None:
