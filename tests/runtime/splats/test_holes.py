@@ -201,7 +201,8 @@ def test_no_backdrop_right_before_a_camera(distance: float) -> None:
     extrinsics = shifted(0, 0)
     extrinsics[1, 2, 3] = wall + distance
     _, backdrop = with_backdrop(np.stack([slanted(0)] * 2), extrinsics)
-    cells = (np.arange(-2, SIZE // CELL + 2) + 0.5) * CELL - SIZE / 2  # two more than the frame on each side
+    beyond = int(np.ceil(MARGIN * SIZE / CELL))  # cells on each side of the frame
+    cells = (np.arange(-beyond, SIZE // CELL + beyond) + 0.5) * CELL - SIZE / 2
     aside = np.hypot(*np.meshgrid(cells, cells)) * wall / K[0, 0]
     expected = np.sort(aside[np.hypot(aside, distance) > wall / MAGNIFIED])
     found = backdrop.means[np.isclose(backdrop.means[:, 2], wall)]
