@@ -1,7 +1,6 @@
 """The options of a refinement, and those that suit a number of views."""
 
 from dataclasses import dataclass
-from math import inf
 from typing import Any
 
 # How the Gaussians of a feed-forward prediction start, measured on held-out views of real captures
@@ -12,7 +11,7 @@ PREDICTION_OPACITY, PREDICTION_SCALE = 0.2, 2.0
 # What their regularisation is, measured there, too: of the Gaussians that show one surface, those that the images need
 # less become transparent, and fewer, larger ones show it.
 PREDICTION_OPACITY_DECAY, PREDICTION_SCALE_GROWTH = 0.25, 0.005
-PREDICTION_MOST_GROWTH = 1.0  # many views have many steps
+MOST_GROWTH = 1.0  # of the log scales in all steps, before it decays: many views have many steps
 
 # Fainter ones are removed: a seventh of them, without which held-out views are the same within 0.01 dB.
 PREDICTION_MIN_OPACITY = 0.05
@@ -31,15 +30,14 @@ class RefinementOptions:
     max_opacity, scale_factor: limit the opacities and enlarge the scales at the start: saturated opacities have almost
     no gradient, and lower ones leave gaps between splats.
     opacity_decay, scale_growth: subtracted from the opacity logits, times the gradient of the opacity, and added to the
-    log scales, of the Gaussians that a step's view sees; both decay with the learning rates. most_growth: of the log
-    scales in the whole refinement, before it decays; a step has its share of it, by steps or by time, if that is less.
+    log scales, of the Gaussians that a step's view sees; both decay with the learning rates.
     ssim_weight: of 1 - SSIM against L1. lr_*: learning rates of Adam; of the means, relative to the median depth.
     lr_poses: of the views' poses, in radians, and relative to the median depth; 0 leaves them as given.
     final_lr: what is left of the learning rates at the end, as they decay exponentially.
     """
 
     steps: int = 120
-    seconds: float = inf
+    seconds: float = float("inf")
     seed: int = 0
     max_gaussians: int = 0
     min_opacity: float = 0.0
@@ -47,7 +45,6 @@ class RefinementOptions:
     scale_factor: float = 1.0
     opacity_decay: float = 0.0
     scale_growth: float = 0.0
-    most_growth: float = inf
     ssim_weight: float = 0.2
     lr_means: float = 2e-3
     lr_scales: float = 6e-2
@@ -70,7 +67,6 @@ def prediction_options(steps: int, **options: Any) -> RefinementOptions:
         max_opacity=PREDICTION_OPACITY,
         scale_factor=PREDICTION_SCALE,
         opacity_decay=PREDICTION_OPACITY_DECAY,
-        scale_growth=PREDICTION_SCALE_GROWTH,
-        most_growth=PREDICTION_MOST_GROWTH,
+        scale_growth=min(PREDICTION_SCALE_GROWTH, MOST_GROWTH / steps),
         **options,
     )

@@ -86,7 +86,6 @@ def refine(
     order = _view_order(len(views), options.seed)
     psnr: list[float] = []
     pruned = not (options.max_gaussians or options.min_opacity)
-    before = -1 / max(options.steps, 1)
     for step in progress(range(options.steps), "refining", detail=lambda: f"{psnr[-1]:.1f} dB" if psnr else ""):
         elapsed = (time.perf_counter() - started) / options.seconds
         if elapsed >= 1:
@@ -96,9 +95,7 @@ def refine(
             optimiser.prune(options.max_gaussians)
             pruned = True
         lr = options.final_lr ** max(step / max(options.steps - 1, 1), elapsed)
-        growth = min(options.scale_growth, options.most_growth * (done - before))
-        before = done
-        psnr.append(optimiser.step(next(order), lr, growth))
+        psnr.append(optimiser.step(next(order), lr))
         if report is not None and not report(step, psnr[-1]):
             break
     optimiser.prune(options.max_gaussians)
@@ -122,11 +119,8 @@ class Optimiser:
         self.contributions = Contributions(len(self.parameters), len(views))
         self.steps = 0
 
-    def step(self, index: int, lr: float, growth: float) -> float:
-        """One step on one view; the view's PSNR before it.
-
-        lr: a factor on all learning rates. growth: of the log scales, which this factor decays, too.
-        """
+    def step(self, index: int, lr: float) -> float:
+        """One step on one view, with this factor on all learning rates; the view's PSNR before it."""
         done = self.rasterizer.forward(self.views[index].target)
         if not self.exposure_adam.visits[index]:
             self.views[index] = _covered(self.views[index], done)
@@ -139,8 +133,8 @@ class Optimiser:
         self.steps += 1
         if self.options.lr_poses:
             self._step_pose(index, self.rasterizer.pose_gradient(done, gradients), lr)
-        decay = self.options.opacity_decay * lr
-        self.rasterizer.step(done, gradients, self.moments, self.lr * lr, self.steps, decay, growth * lr)
+        decay, growth = self.options.opacity_decay * lr, self.options.scale_growth * lr
+        self.rasterizer.step(done, gradients, self.moments, self.lr * lr, self.steps, decay, growth)
         self._step_exposure(index, loss.gradient, done.rgb, lr)
         return _psnr(rendered, view)
 

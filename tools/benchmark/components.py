@@ -122,7 +122,7 @@ def refinement() -> Prepared:
     optimiser = Optimiser(pixel_sized_splats(RENDERED_SPLATS), [view], RefinementOptions(ssim_weight=0))
 
     def run() -> None:
-        optimiser.step(0, lr=1.0, growth=0.0)
+        optimiser.step(0, 1.0)
 
     return None, run
 

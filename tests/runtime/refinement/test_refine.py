@@ -1,12 +1,10 @@
 """Refinement: it brings a scene closer to its images, depends on the seed alone, and stops when told to."""
 
-import itertools
 from dataclasses import fields, replace
-from math import inf
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from idesplat.runtime.refinement.options import prediction_options
 from idesplat.runtime.refinement.rasterizer import GradientRasterizer, Parameters
 from idesplat.runtime.refinement.refine import Optimiser, PosedImage, RefinementOptions, refine
 from idesplat.runtime.rendering.render import render_view
@@ -156,18 +154,9 @@ def test_opacities_decay_and_scales_grow_where_a_view_sees_them(views: list[Pose
     np.testing.assert_allclose(refined.scales[:400][changed], 0.12 * np.exp(0.05), rtol=1e-5)
 
 
-@pytest.mark.parametrize(("steps", "seconds", "growth"), [(10, inf, 0.02), (100_000, 10, 0.02), (2, inf, 0.03)])
-def test_the_growth_of_scales_is_shared_out_over_the_steps_or_the_time(
-    views: list[PosedImage], monkeypatch: pytest.MonkeyPatch, steps: int, seconds: float, growth: float
-) -> None:
-    """A step has a tenth of 0.2 where ten steps, or ten seconds and one for each step, end it; 0.03 at most."""
-    grown: list[float] = []
-    monkeypatch.setattr(Optimiser, "step", lambda self, index, lr, growth: grown.append(growth) or 20.0)
-    clock = SimpleNamespace(perf_counter=itertools.count().__next__)
-    monkeypatch.setattr("idesplat.runtime.refinement.refine.time", clock)
-    options = RefinementOptions(steps=steps, seconds=seconds, scale_growth=0.03, most_growth=0.2)
-    assert refine(scene(0), views, options).steps in (steps, seconds - 1)
-    np.testing.assert_allclose(grown, growth, rtol=1e-3)
+@pytest.mark.parametrize(("steps", "growth"), [(40, 0.005), (200, 0.005), (920, 1 / 920)])
+def test_scales_of_a_prediction_grow_by_e_at_most(steps: int, growth: float) -> None:
+    assert prediction_options(steps).scale_growth == pytest.approx(growth)
 
 
 def test_faint_gaussians_are_removed(views: list[PosedImage], monkeypatch: pytest.MonkeyPatch) -> None:
