@@ -114,12 +114,12 @@ def build_view_batch(
     count: select this many views; all by default.
     skip_damaged: leave out images that cannot be read or have a defect, and list them in `ViewBatch.skipped`.
     check_images: look for defects of the images that are used, as `checks` describes them; check_cameras: also for
-    images that do not fit their cameras.
+    images that do not fit their cameras, which estimated ones do.
     copy_side: longer side of `ViewBatch.copies` in pixels; 0 for none.
     Raises InputError for fewer than two views, two cameras with the same pose, cameras without a baseline, or an image
     that cannot be read, whose size does not match its camera, or that has a defect; blurred images only give a warning.
     """
-    loader = ViewLoader(pairs, height, width, match=check_cameras, copy_side=copy_side)
+    loader = ViewLoader(pairs, height, width, match=check_images, copy_side=copy_side)
     usable = list(range(len(pairs)))
     skipped: list[str] = []
     while True:

@@ -1,9 +1,9 @@
-"""Images that would spoil a reconstruction: blank, overexposed, blurred, of another scene, twice, or with a camera that
-does not fit them.
+"""Images that would spoil a reconstruction: blank, overexposed, blurred, of another scene or another state of it, given
+twice, or with a camera that does not fit them.
 
 Of the chosen views, each is compared with its nearest one, as the depth range is found, so that the matches are used
 twice. Only where that fails are others compared, to tell which of the two is at fault: a view that fits no other is, if
-those that it fails with fit others.
+those that it fails with fit others. Views of another state of the scene fit all the same; `contradictions` tells them.
 """
 
 import logging
@@ -16,6 +16,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..geometry.baselines import coinciding_poses, nearest_neighbor_pairs, pairwise_baselines, position_rounding
+from .contradictions import MIN_SPREAD, Contradiction, find_contradictions
 from .image_quality import (
     ImageStatistics,
     describe_blank,
@@ -36,7 +37,7 @@ MIN_OVERLAP, MIN_PARALLAX_DEG, MAX_PARALLAX_DEG = 0.3, 0.1, 25.0
 # Of a pair of which common points are expected; beyond these limits good pairs may have none.
 MIN_SURE_OVERLAP, MAX_SURE_PARALLAX_DEG = 0.6, 15.0
 
-SAME_IMAGE, SAME_POSE = "is the same image", "has the same pose"
+SAME_IMAGE, SAME_POSE, CONTRADICTS = "is the same image", "has the same pose", "contradicts"
 
 
 @dataclass(frozen=True)
@@ -51,15 +52,17 @@ class Defect:
 def find_defects(loader: ViewLoader, chosen: Sequence[int], usable: Sequence[int], cameras: bool) -> list[Defect]:
     """What is wrong with the chosen images, one defect for each that has any.
 
-    chosen, usable: indices of the loader's pairs, sorted; the usable ones are those to compare the chosen ones with.
-    cameras: whether the images must fit their cameras; the loader then needs to make feature images.
+    loader: one that makes feature images. chosen, usable: indices of the loader's pairs, sorted; the usable ones are
+    those to compare the chosen ones with. cameras: whether the images may not fit their cameras.
     Raises InputError if no two images fit their cameras, or if a chosen image cannot be read.
     """
     checker = _Checker(loader, usable)
     defects = checker.blank(chosen) or checker.poor(chosen)  # what these show is no use for comparisons
-    if cameras and all(defect.soft for defect in defects):
+    if all(defect.soft for defect in defects):
         blurred = {defect.index for defect in defects}
-        defects += checker.misfits([index for index in chosen if index not in blurred])
+        sharp = [index for index in chosen if index not in blurred]
+        misfits = checker.misfits(sharp) if cameras else []
+        defects += misfits or checker.contradictions(sharp)
     for defect in defects:
         LOG.info("%s", defect.what)
     return defects
@@ -99,7 +102,7 @@ class _Checker:
         Raises InputError if none fit.
         """
         poses = self._extrinsics(chosen)
-        if len(chosen) < MIN_VIEWS or pairwise_baselines(poses).max() <= position_rounding(poses):
+        if not _has_baseline(poses):
             return []
         twins = self._twins(chosen, poses)
         pairs = {(chosen[i], chosen[j]) for i, j in nearest_neighbor_pairs(poses)} - set(twins)
@@ -113,6 +116,19 @@ class _Checker:
             if not {first, second} & set(at_fault):
                 found.append(self._defect(second, f"{what} as {self.loader.name(first)}, expected another"))
         return found
+
+    def contradictions(self, chosen: Sequence[int]) -> list[Defect]:
+        """Images of another state of the scene than most of the chosen ones."""
+        if len(chosen) <= MIN_VIEWS or not _has_baseline(self._extrinsics(chosen)):
+            return []
+        suitable = {index: [other for other in self._overlapping(index) if other in chosen] for index in chosen}
+        pairs = sorted({tuple(sorted((i, j))) for i, others in suitable.items() for j in others[:NEIGHBOURS]})
+        place = {index: place for place, index in enumerate(chosen)}
+        parallax = [float(self._scores(first, [second]).parallax[0]) for first, second in pairs]
+        images = [self.loader.feature_image(index).whole for index in chosen]
+        found = find_contradictions(images, [(place[first], place[second]) for first, second in pairs], parallax)
+        names = [self.loader.name(index) for index in chosen]
+        return [self._defect(chosen[view], _describe_state(view, shown, names)) for view, shown in found.items()]
 
     def _twins(self, chosen: Sequence[int], poses: np.ndarray) -> dict[tuple[int, int], str]:
         """Pairs of the same image or the same pose, and what is the same."""
@@ -220,3 +236,18 @@ class _Checker:
 
     def _defect(self, index: int, what: str, soft: bool = False) -> Defect:
         return Defect(index, f"{self.loader.name(index)}: {what}", soft)
+
+
+def _has_baseline(poses: np.ndarray) -> bool:
+    return len(poses) >= MIN_VIEWS and bool(pairwise_baselines(poses).max() > position_rounding(poses))
+
+
+def _describe_state(view: int, shown: Contradiction, names: Sequence[str]) -> str:
+    """What is wrong with a view of another state of the scene. names: of the views."""
+    other = names[shown.other]
+    if view != shown.view:
+        return f"shows the scene as {names[shown.view]}, which {CONTRADICTS} {other}"
+    return (
+        f"{CONTRADICTS} {other}: their common points cover {100 * shown.spread:.0f} % of the area expected, "
+        f"{100 * MIN_SPREAD:.0f} % at least; part of the scene was moved between them"
+    )

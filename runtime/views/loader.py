@@ -58,6 +58,13 @@ class FeatureImage:
         """The same at a fraction of the size, and of the time for features."""
         return FeatureImage(self._grey, self.camera, self._crop, self._max_side // REDUCTION)
 
+    @cached_property
+    def whole(self) -> "FeatureImage":
+        """The same without the crop, with features of its own; this image if nothing is cut off."""
+        if len(self.inside.keypoints) == len(self.features.keypoints):
+            return self
+        return FeatureImage(self._grey, self.camera, max_side=self._max_side)
+
     def match(self, other: "FeatureImage") -> np.ndarray:
         """Matches of the features inside both crops, as index pairs [matches, 2]."""
         if other not in self._matches:

@@ -301,6 +301,23 @@ def test_exposure_is_compensated_unless_it_is_switched_off(
         assert scene_of_two.exposure.is_identity is (mode is ExposureMode.OFF)
 
 
+def test_views_with_defects_are_left_out_of_a_window_with_the_frames_beside_them(
+    capture_file: Path, scene: Path, exported: tuple[Path, Path], tmp_path: Path
+) -> None:
+    shutil.copytree(scene / "images", tmp_path / "images")
+    cv2.imwrite(str(tmp_path / "images" / NAMES[0]), np.zeros((96, 128, 3), np.uint8))
+    (capture,) = read_captures()
+    predictor = Predictor(exported[0])
+    plan = make_plan("fast", predictor.model, "0", FilterOptions(), 0)
+    images = CaptureImages(capture, tmp_path / "images", (64, 96))
+    (window,) = CaptureEvaluator(predictor, {}, plan).evaluate(capture, images, [3]).cases[3]
+    assert window.left_out == NAMES[:1] and window.context == [NAMES[2], NAMES[4]]
+    (target,) = window.targets
+    assert target.name == NAMES[3]
+    for metric, value in target.scores["pairs"].items():  # what is left are the two around
+        assert target.scores["model"][metric] == pytest.approx(value, abs=1e-6), metric
+
+
 @pytest.mark.slow
 def test_bad_frames_are_found_and_good_ones_are_not(
     capture_file: Path, repository: tuple[Path, str], capsys: Capsys, monkeypatch: pytest.MonkeyPatch

@@ -55,6 +55,10 @@ def print_captures(results: Sequence[CaptureScores], counts: Sequence[int], size
             table.add_row(f"mean of {having}", str(count), *(_cell(means, column) for column in measured))
     say(f"real captures at {size}, PSNR in dB; {PAIR} views: triples, more: the middle of a path of views")
     print_table(table)
+    for result in results:
+        for count, cases in result.cases.items():
+            if cases[0].left_out:
+                say(f"{result.name}, {count} views: without {', '.join(cases[0].left_out)}, which contradict others")
 
 
 def write_capture_results(folder: Path, result: "CaptureEvaluation") -> Path:

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -59,12 +59,16 @@ class TargetScores:
 
 @dataclass(frozen=True)
 class CaseScores:
-    """One prediction: its context, the held-out frames, and its context frames rendered from all its Gaussians."""
+    """One prediction: its context, the held-out frames, and its context frames rendered from all its Gaussians.
+
+    left_out: frames of the window that are not in the context, since the checks of images find a defect.
+    """
 
     context: list[str]
     targets: list[TargetScores]
     input_psnr: float
     seconds: float
+    left_out: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -108,7 +112,8 @@ class CaptureEvaluator:
         """The capture's triples if `counts` has 2, and its middle views for every other number of views.
 
         Windows of views are compared with the nearest view and the best fronto-parallel plane (oracle) of the two views
-        around each held-out frame, and with the model given these two.
+        around each held-out frame, and with the model given these two. Views with defects are left out, as by
+        `idesplat infer`, and with them the held-out frames on either side.
         show: receives a name and a strip for each held-out frame: truth, render, error, depth and plane.
         Raises InputError for what the model cannot take.
         """
@@ -121,8 +126,10 @@ class CaptureEvaluator:
                     for triple in capture.triples
                 ]
                 continue
-            context, targets = capture.window(count)
-            if not context:
+            window, between = capture.window(count)
+            context = images.without_defects(window) if window else []
+            targets = [target for target in between if set(capture.neighbours(target).context) <= set(context)]
+            if not targets:
                 continue
             for target in targets:
                 if target not in pairs:
@@ -130,7 +137,9 @@ class CaptureEvaluator:
                     case = images.case(triple.context, [target], self.predictor.depth_range)
                     pairs[target] = self._triple(case, None).targets[0].scores
             case = images.case(context, targets, self.predictor.depth_range)
-            result.cases[count] = [self._window(case, pairs, show)]
+            before = [context.index(capture.neighbours(target).context[0]) for target in targets]
+            left_out = [name for name in window if name not in context]
+            result.cases[count] = [replace(self._window(case, before, pairs, show), left_out=left_out)]
         return result
 
     def predict(self, case: EvalCase) -> Scene:
@@ -156,7 +165,7 @@ class CaptureEvaluator:
         rendering = render_target(scene.gaussians, case.targets, 0)
         nearest = case.context.image(nearest_view(case.context, pose))
         scores = {
-            MODEL: self._measure_scene(scene, rendering.rgb, case, 0),
+            MODEL: self._measure_scene(scene, rendering.rgb, case, 0, [0, 1]),
             NEAREST: self._measure(nearest, truth, valid),
             ORACLE_PLANE: self._measure(plane, truth, valid),
         }
@@ -165,27 +174,30 @@ class CaptureEvaluator:
         targets = [TargetScores(case.targets.names[0], scores)]
         return CaseScores(case.context.names, targets, _input_psnr(scene.gaussians, case), scene.seconds)
 
-    def _window(self, case: EvalCase, pairs: dict[str, Scores], show: Show | None) -> CaseScores:
-        """Evaluate several views and the held-out frames between them; pairs: each frame's scores from two views."""
+    def _window(self, case: EvalCase, before: Sequence[int], pairs: dict[str, Scores], show: Show | None) -> CaseScores:
+        """Evaluate several views and the held-out frames between them.
+
+        before: for each held-out frame, the context view before it. pairs: each frame's scores from two views.
+        """
         scene = self.predict(case)
         targets = []
         for index, name in enumerate(case.targets.names):
             truth, valid = case.targets.image(index), case.targets.valid[index]
             rendering = render_target(scene.gaussians, case.targets, index)
-            scores = {MODEL: self._measure_scene(scene, rendering.rgb, case, index), PAIRS: pairs[name][MODEL]}
+            around = [before[index], before[index] + 1]
+            scores = {MODEL: self._measure_scene(scene, rendering.rgb, case, index, around), PAIRS: pairs[name][MODEL]}
             scores |= {method: pairs[name][method] for method in (NEAREST, ORACLE_PLANE)}
             targets.append(TargetScores(name, scores))
             if show is not None:
                 show(_strip_name(case, index), comparison_strip(truth, valid, rendering, None))
         return CaseScores(case.context.names, targets, _input_psnr(scene.gaussians, case), scene.seconds)
 
-    def _measure_scene(self, scene: Scene, image: np.ndarray, case: EvalCase, index: int) -> dict[str, float]:
-        """The metrics of a render, and its PSNR in the mean exposure of the context views around.
-
-        The held-out frame `index` lies between the context views `index` and `index + 1`.
-        """
+    def _measure_scene(
+        self, scene: Scene, image: np.ndarray, case: EvalCase, index: int, around: Sequence[int]
+    ) -> dict[str, float]:
+        """The metrics of a held-out frame's render, and its PSNR in the mean exposure of the context views around."""
         truth, valid = case.targets.image(index), case.targets.valid[index]
-        interpolated = scene.in_exposure_of(image, [index, index + 1])
+        interpolated = scene.in_exposure_of(image, around)
         return self._measure(image, truth, valid) | {INTERPOLATED: psnr(interpolated, truth, valid)}
 
     def _measure(self, image: np.ndarray, truth: np.ndarray, valid: np.ndarray) -> dict[str, float]:
