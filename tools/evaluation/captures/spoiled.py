@@ -23,12 +23,11 @@ from ....runtime.cameras.undistortion import shrink
 from ....runtime.cli.terminal import run, say
 from ....runtime.errors import InputError
 from ....runtime.images.colormaps import to_uint8
-from ....runtime.images.io import load_image
 from ....runtime.views.checks import CONTRADICTS, find_defects
 from ....runtime.views.loader import ViewLoader
 from ....runtime.views.selection import PairScorer, guess_scene_depths
 from ..report import print_table
-from .capture import Capture, read_captures
+from .capture import Capture, load_cropped, read_captures
 from .checkouts import frames_of
 
 Posed = tuple[np.ndarray, Camera]  # image, uint8 RGB [height, width, 3], and its camera
@@ -83,7 +82,7 @@ def _load(capture: Capture, checkouts: Path) -> list[Posed]:
     pairs = []
     with frames_of(checkouts, capture) as folder:
         for name, camera in capture.cameras.items():
-            image = load_image(folder / name)
+            image = load_cropped(folder / name, capture.crop)
             pairs.append(shrink(image, resize_camera(camera, image.shape[1], image.shape[0]), SIDE))
     return pairs
 
