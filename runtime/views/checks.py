@@ -121,9 +121,9 @@ class _Checker:
         """Images of another state of the scene than most of the chosen ones."""
         if len(chosen) <= MIN_VIEWS or not _has_baseline(self._extrinsics(chosen)):
             return []
-        suitable = {index: [other for other in self._overlapping(index) if other in chosen] for index in chosen}
-        pairs = sorted({tuple(sorted((i, j))) for i, others in suitable.items() for j in others[:NEIGHBOURS]})
         place = {index: place for place, index in enumerate(chosen)}
+        suitable = {index: [other for other in self._overlapping(index) if other in place] for index in chosen}
+        pairs = sorted({tuple(sorted((i, j))) for i, others in suitable.items() for j in others[:NEIGHBOURS]})
         parallax = [float(self._scores(first, [second]).parallax[0]) for first, second in pairs]
         images = [self.loader.feature_image(index).whole for index in chosen]
         found = find_contradictions(images, [(place[first], place[second]) for first, second in pairs], parallax)

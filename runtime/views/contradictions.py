@@ -6,7 +6,7 @@ the image than those that a view has in common with others. Views that no points
 different states of the scene.
 """
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -59,7 +59,9 @@ def find_contradictions(
         elif spreads and angle <= MAX_PARALLAX_DEG:
             apart += [Contradiction(first, second, min(spreads)), Contradiction(second, first, min(spreads))]
     states = _components(linked)
-    majority = np.bincount(states).argmax()
+    majority, size = max(Counter(states.tolist()).items(), key=lambda state: state[1])
+    if size == 1:
+        return {}
     against = sorted((pair for pair in apart if states[pair.other] == majority), key=lambda pair: pair.spread)
     found = {}
     for view, state in enumerate(states.tolist()):
@@ -97,9 +99,10 @@ def _spread(
     for third, part in common[view].items():
         if third != other:
             expected |= _cells(images[view], part.rays[_visible(part.points, images[other])])
-    if len(expected) < MIN_CELLS:
+    area = _area(expected)
+    if len(expected) < MIN_CELLS or area == 0:
         return None
-    return _area(_cells(images[view], common[view][other].rays)) / _area(expected)
+    return _area(_cells(images[view], common[view][other].rays)) / area
 
 
 def _cells(image: FeatureImage, rays: np.ndarray) -> set[tuple[int, int]]:
@@ -117,7 +120,7 @@ def _visible(points: np.ndarray, image: FeatureImage) -> np.ndarray:
 
 
 def _area(cells: set[tuple[int, int]]) -> float:
-    """The area that cells are spread over, up to a factor: that of the ellipse of their covariance."""
+    """The area that cells are spread over, up to a factor: that of the ellipse of their covariance; 0 on a line."""
     if len(cells) <= 2:
         return 0.0
     return float(np.sqrt(max(np.linalg.det(np.cov(np.array(sorted(cells), float).T)), 0)))

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from idesplat.runtime.cameras.camera import Camera
 from idesplat.runtime.errors import InputError
+from idesplat.runtime.views import contradictions
 from idesplat.runtime.views.batch import build_view_batch
+from idesplat.runtime.views.contradictions import MIN_SPREAD, Contradiction, find_contradictions
 from idesplat.runtime.views.pair_fit import Verdict, fit_pair
 
 HEIGHT, WIDTH, FOCAL = 360, 480, 400
@@ -101,3 +103,22 @@ def test_an_object_before_a_plain_background_is_no_contradiction(monkeypatch):
     monkeypatch.setitem(BEHIND, "before", PLAIN)
     monkeypatch.setitem(BEHIND, "after", PLAIN // 2)
     assert len(build(make_views(["before"] * 4 + ["after"] * 2)).names) == 6
+
+
+def test_points_on_one_line_tell_nothing(monkeypatch):
+    """They are spread over no area."""
+    for state, background in BEHIND.items():
+        line = np.zeros_like(background)
+        line[HEIGHT + 8 : HEIGHT + 20] = background[HEIGHT + 8 : HEIGHT + 20]  # within a row of cells
+        monkeypatch.setitem(BEHIND, state, line)
+    monkeypatch.setitem(globals(), "THING", np.zeros_like(THING))
+    assert len(build(make_views(["before"] * 5)).names) == 5
+
+
+def test_where_no_views_are_linked_none_is_of_another_state_than_most(monkeypatch):
+    pairs = make_views(["before"] * 3)
+    loaded = build_view_batch(pairs, None, 128, 160).feature_images
+    monkeypatch.setattr(contradictions, "_spread", lambda *_: MIN_SPREAD / 2)
+    assert find_contradictions(loaded, [(0, 1), (1, 2)], [3.0, 3.0]) == {}
+    monkeypatch.setattr(contradictions, "_spread", lambda *views: MIN_SPREAD * (0.5 if 2 in views[2:] else 1))
+    assert find_contradictions(loaded, [(0, 1), (1, 2)], [3.0, 3.0]) == {2: Contradiction(2, 1, MIN_SPREAD / 2)}
