@@ -58,7 +58,8 @@ def print_captures(results: Sequence[CaptureScores], counts: Sequence[int], size
     for result in results:
         for count, cases in result.cases.items():
             if cases[0].left_out:
-                say(f"{result.name}, {count} views: without {', '.join(cases[0].left_out)}, which contradict others")
+                left_out = ", ".join(cases[0].left_out)
+                say(f"{result.name}, {count} views: without {left_out}, which `infer` leaves out, too")
 
 
 def write_capture_results(folder: Path, result: "CaptureEvaluation") -> Path:
