@@ -53,6 +53,11 @@ def position_rounding(extrinsics: np.ndarray) -> float:
     return ROUNDING_STEPS * float(np.finfo(extrinsics.dtype).eps * np.abs(extrinsics[:, :3, 3]).max())
 
 
+def have_baseline(extrinsics: np.ndarray) -> bool:
+    """Whether two of the cameras are at different positions, beyond rounding; for poses [cameras, 4, 4]."""
+    return bool(pairwise_baselines(extrinsics).max() > position_rounding(extrinsics))
+
+
 def coinciding_poses(extrinsics: np.ndarray) -> list[tuple[int, int]]:
     """Pairs (i, j), i < j, of poses [cameras, 4, 4] with the same position and rotation, up to rounding."""
     baselines, rotations = pairwise_baselines(extrinsics), extrinsics[:, :3, :3]

@@ -13,7 +13,7 @@ import numpy as np
 from ..cameras.camera import Camera
 from ..cameras.undistortion import UndistortedImage
 from ..errors import InputError, error_context
-from ..geometry.baselines import coinciding_poses, nearest_neighbor_pairs, pairwise_baselines, position_rounding
+from ..geometry.baselines import coinciding_poses, have_baseline, nearest_neighbor_pairs
 from ..geometry.intrinsics import check_intrinsics
 from ..geometry.rigid import check_rigid
 from ..images.finding import image_stem
@@ -267,7 +267,7 @@ def _examples(names: Sequence[object]) -> str:
 
 def _check_distinct(extrinsics: np.ndarray, names: Sequence[str]) -> None:
     """Raise InputError for cameras without a baseline, and for two cameras with the same pose."""
-    if pairwise_baselines(extrinsics).max() <= position_rounding(extrinsics):
+    if not have_baseline(extrinsics):
         raise InputError(
             f"{names[0]} and {names[1]} are at the same position, as are all cameras; depth needs a baseline"
         )

@@ -11,11 +11,12 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 
 import numpy as np
 
 from ..errors import InputError
-from ..geometry.baselines import coinciding_poses, nearest_neighbor_pairs, pairwise_baselines, position_rounding
+from ..geometry.baselines import coinciding_poses, have_baseline, nearest_neighbor_pairs, pairwise_baselines
 from .contradictions import MIN_SPREAD, Contradiction, find_contradictions
 from .image_quality import (
     ImageStatistics,
@@ -37,16 +38,20 @@ MIN_OVERLAP, MIN_PARALLAX_DEG, MAX_PARALLAX_DEG = 0.3, 0.1, 25.0
 # Of a pair of which common points are expected; beyond these limits good pairs may have none.
 MIN_SURE_OVERLAP, MAX_SURE_PARALLAX_DEG = 0.6, 15.0
 
-SAME_IMAGE, SAME_POSE, CONTRADICTS = "is the same image", "has the same pose", "contradicts"
+SAME_IMAGE, SAME_POSE = "is the same image", "has the same pose"
 
 
 @dataclass(frozen=True)
 class Defect:
-    """index: of the image. what: is wrong with it, for the user. soft: whether it can still be used."""
+    """index: of the image. what: is wrong with it, for the user. soft: whether it can still be used.
+
+    contradicts: whether the image shows another state of the scene.
+    """
 
     index: int
     what: str
     soft: bool = False
+    contradicts: bool = False
 
 
 def find_defects(loader: ViewLoader, chosen: Sequence[int], usable: Sequence[int], cameras: bool) -> list[Defect]:
@@ -102,7 +107,7 @@ class _Checker:
         Raises InputError if none fit.
         """
         poses = self._extrinsics(chosen)
-        if not _has_baseline(poses):
+        if len(chosen) < MIN_VIEWS or not have_baseline(poses):
             return []
         twins = self._twins(chosen, poses)
         pairs = {(chosen[i], chosen[j]) for i, j in nearest_neighbor_pairs(poses)} - set(twins)
@@ -119,16 +124,19 @@ class _Checker:
 
     def contradictions(self, chosen: Sequence[int]) -> list[Defect]:
         """Images of another state of the scene than most of the chosen ones."""
-        if len(chosen) <= MIN_VIEWS or not _has_baseline(self._extrinsics(chosen)):
+        if len(chosen) <= MIN_VIEWS or not have_baseline(self._extrinsics(chosen)):
             return []
         place = {index: place for place, index in enumerate(chosen)}
-        suitable = {index: [other for other in self._overlapping(index) if other in place] for index in chosen}
-        pairs = sorted({tuple(sorted((i, j))) for i, others in suitable.items() for j in others[:NEIGHBOURS]})
-        parallax = [float(self._scores(first, [second]).parallax[0]) for first, second in pairs]
-        images = [self.loader.feature_image(index).whole for index in chosen]
-        found = find_contradictions(images, [(place[first], place[second]) for first, second in pairs], parallax)
+        parallax: dict[tuple[int, int], float] = {}
+        for index in chosen:
+            for other, angle in islice(self._overlapping(index, chosen).items(), NEIGHBOURS):
+                parallax[place[min(index, other)], place[max(index, other)]] = angle
+        found = find_contradictions([self.loader.feature_image(index).whole for index in chosen], parallax)
         names = [self.loader.name(index) for index in chosen]
-        return [self._defect(chosen[view], _describe_state(view, shown, names)) for view, shown in found.items()]
+        return [
+            Defect(chosen[view], f"{names[view]}: {_describe_state(view, shown, names)}", contradicts=True)
+            for view, shown in found.items()
+        ]
 
     def _twins(self, chosen: Sequence[int], poses: np.ndarray) -> dict[tuple[int, int], str]:
         """Pairs of the same image or the same pose, and what is the same."""
@@ -199,7 +207,7 @@ class _Checker:
     def _neighbours(self, index: int) -> list[int]:
         """The usable images that overlap best with one, by their cameras, without unreadable and blank ones."""
         found = []
-        for other in self._overlapping(index):
+        for other in self._overlapping(index, self.usable):
             with suppress(InputError):  # one that is not chosen is no reason to stop
                 if describe_blank(self._measured(other)) is None:
                     found.append(other)
@@ -207,13 +215,13 @@ class _Checker:
                 break
         return found
 
-    def _overlapping(self, index: int) -> list[int]:
-        """The usable images that overlap with one by their cameras, those of lowest cost first."""
-        scores = self._scores(index, self.usable)
+    def _overlapping(self, index: int, others: Sequence[int]) -> dict[int, float]:
+        """Of other images, those that overlap with one by their cameras, with their parallax, lowest cost first."""
+        scores = self._scores(index, others)
         suitable = (scores.overlap >= MIN_OVERLAP) & (scores.parallax <= MAX_PARALLAX_DEG)
         suitable &= scores.parallax >= MIN_PARALLAX_DEG
         order = np.argsort(scores.cost, kind="stable")
-        return [self.usable[other] for other in order.tolist() if suitable[other]]
+        return {others[other]: float(scores.parallax[other]) for other in order.tolist() if suitable[other]}
 
     def _surely_overlap(self, first: int, second: int) -> bool:
         scores = self._scores(first, [second])
@@ -238,16 +246,12 @@ class _Checker:
         return Defect(index, f"{self.loader.name(index)}: {what}", soft)
 
 
-def _has_baseline(poses: np.ndarray) -> bool:
-    return len(poses) >= MIN_VIEWS and bool(pairwise_baselines(poses).max() > position_rounding(poses))
-
-
 def _describe_state(view: int, shown: Contradiction, names: Sequence[str]) -> str:
     """What is wrong with a view of another state of the scene. names: of the views."""
     other = names[shown.other]
     if view != shown.view:
-        return f"shows the scene as {names[shown.view]}, which {CONTRADICTS} {other}"
+        return f"shows the scene as {names[shown.view]}, which contradicts {other}"
     return (
-        f"{CONTRADICTS} {other}: their common points cover {100 * shown.spread:.0f} % of the area expected, "
+        f"contradicts {other}: their common points cover {100 * shown.spread:.0f} % of the area expected, "
         f"{100 * MIN_SPREAD:.0f} % at least; part of the scene was moved between them"
     )

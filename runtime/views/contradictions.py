@@ -7,11 +7,13 @@ different states of the scene.
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from ..geometry.consistency import project_to_view
+from ..geometry.intrinsics import normalize_intrinsics
 from ..geometry.rigid import invert_rigid
 from ..sfm.features import triangulate
 from .loader import FeatureImage
@@ -42,16 +44,16 @@ class _Common:
 
 
 def find_contradictions(
-    images: Sequence[FeatureImage], pairs: Sequence[tuple[int, int]], parallax: Sequence[float]
+    images: Sequence[FeatureImage], parallax: Mapping[tuple[int, int], float]
 ) -> dict[int, Contradiction]:
     """The views that show another state of the scene than most, each with a pair that shows it.
 
     The pair is one of the view's own, if it has any, else that of a view of the same state.
-    pairs: of overlapping images, as indices. parallax: of each pair, in degrees.
+    parallax: in degrees, of pairs of overlapping images by their indices.
     """
-    common = _match(images, pairs)
+    common = _match(images, parallax)
     linked, apart = np.eye(len(images), dtype=bool), []
-    for (first, second), angle in zip(pairs, parallax, strict=True):
+    for (first, second), angle in parallax.items():
         both = (_spread(images, common, *pair) for pair in ((first, second), (second, first)))
         spreads = [spread for spread in both if spread is not None]
         if spreads and min(spreads) >= MIN_SPREAD:
@@ -71,7 +73,7 @@ def find_contradictions(
     return found
 
 
-def _match(images: Sequence[FeatureImage], pairs: Sequence[tuple[int, int]]) -> dict[int, dict[int, _Common]]:
+def _match(images: Sequence[FeatureImage], pairs: Iterable[tuple[int, int]]) -> dict[int, dict[int, _Common]]:
     """What each view has in common with others, by their indices."""
     common: dict[int, dict[int, _Common]] = defaultdict(dict)
     for view, other in pairs:
@@ -79,7 +81,8 @@ def _match(images: Sequence[FeatureImage], pairs: Sequence[tuple[int, int]]) -> 
         b_from_a = invert_rigid(b.camera.extrinsics) @ a.camera.extrinsics
         matches = match_along_epipolar_lines(a.inside, b.inside, a.camera.K, b.camera.K, b_from_a, a.match(b))
         if len(matches.first) >= MIN_POINTS:
-            points = _transform(a.camera.extrinsics, triangulate(matches.first, matches.second, b_from_a))
+            pose = a.camera.extrinsics
+            points = triangulate(matches.first, matches.second, b_from_a) @ pose[:3, :3].T + pose[:3, 3]
             common[view][other] = _Common(matches.first, points)
             common[other][view] = _Common(matches.second, points)
     return common
@@ -114,9 +117,9 @@ def _cells(image: FeatureImage, rays: np.ndarray) -> set[tuple[int, int]]:
 
 def _visible(points: np.ndarray, image: FeatureImage) -> np.ndarray:
     """Which points [points, 3] lie in an image, bool [points]."""
-    in_camera = _transform(invert_rigid(image.camera.extrinsics), points)
-    x, y, z = (in_camera @ image.camera.K.T).T
-    return (z > 0) & (x >= 0) & (y >= 0) & (x < z * image.camera.width) & (y < z * image.camera.height)
+    camera = image.camera
+    intrinsics = normalize_intrinsics(camera.K, camera.width, camera.height)
+    return project_to_view(points, (camera.height, camera.width), camera.extrinsics, intrinsics)[2]
 
 
 def _area(cells: set[tuple[int, int]]) -> float:
@@ -124,10 +127,6 @@ def _area(cells: set[tuple[int, int]]) -> float:
     if len(cells) <= 2:
         return 0.0
     return float(np.sqrt(max(np.linalg.det(np.cov(np.array(sorted(cells), float).T)), 0)))
-
-
-def _transform(transform: np.ndarray, points: np.ndarray) -> np.ndarray:
-    return points @ transform[:3, :3].T + transform[:3, 3]
 
 
 def _components(linked: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ from enum import Enum
 
 import numpy as np
 
-from ..geometry.baselines import pairwise_baselines, position_rounding
+from ..geometry.baselines import have_baseline
 from ..geometry.rigid import invert_rigid
 from ..sfm.features import EPSILON, match_features, normalize_points, sampson_distance, triangulate
 from ..sfm.two_view import estimate_relative_pose
@@ -73,7 +73,7 @@ class PairFit:
 def fit_pair(first: FeatureImage, second: FeatureImage) -> PairFit:
     """How two images fit their cameras."""
     poses = np.stack([first.camera.extrinsics, second.camera.extrinsics])
-    if pairwise_baselines(poses).max() <= position_rounding(poses):
+    if not have_baseline(poses):
         return PairFit(Verdict.UNKNOWN)  # without a baseline there are no epipolar lines
     second_from_first = invert_rigid(poses[1]) @ poses[0]
     matches = first.match(second)

@@ -116,9 +116,9 @@ def test_points_on_one_line_tell_nothing(monkeypatch):
 
 
 def test_where_no_views_are_linked_none_is_of_another_state_than_most(monkeypatch):
-    pairs = make_views(["before"] * 3)
-    loaded = build_view_batch(pairs, None, 128, 160).feature_images
+    loaded = build_view_batch(make_views(["before"] * 3), None, 128, 160).feature_images
+    parallax = {(0, 1): 3.0, (1, 2): 3.0}
     monkeypatch.setattr(contradictions, "_spread", lambda *_: MIN_SPREAD / 2)
-    assert find_contradictions(loaded, [(0, 1), (1, 2)], [3.0, 3.0]) == {}
+    assert find_contradictions(loaded, parallax) == {}
     monkeypatch.setattr(contradictions, "_spread", lambda *views: MIN_SPREAD * (0.5 if 2 in views[2:] else 1))
-    assert find_contradictions(loaded, [(0, 1), (1, 2)], [3.0, 3.0]) == {2: Contradiction(2, 1, MIN_SPREAD / 2)}
+    assert find_contradictions(loaded, parallax) == {2: Contradiction(2, 1, MIN_SPREAD / 2)}

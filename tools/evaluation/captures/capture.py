@@ -32,10 +32,9 @@ from ....runtime.geometry.intrinsics import intrinsic_matrix
 from ....runtime.geometry.quaternions import quaternions_to_matrices
 from ....runtime.images.io import load_image
 from ....runtime.system.limits import parse_whole_number
-from ....runtime.views.batch import ViewBatch
-from ....runtime.views.checks import find_defects
+from ....runtime.views.batch import ViewBatch, build_view_batch
 from ....runtime.views.depth_range import DepthRange
-from ....runtime.views.loader import ImageCameraPair, ViewLoader, load_view
+from ....runtime.views.loader import ImageCameraPair, load_view
 from ..cases import EvalCase, PosedImages
 from ..image_folders import valid_pixels
 
@@ -138,9 +137,8 @@ class CaptureImages:
 
     def without_defects(self, names: Sequence[str]) -> list[str]:
         """These frames without those that `idesplat infer` would leave out, for what they show or their cameras."""
-        loader, everything = ViewLoader(self.pairs(names), *self.size, match=True), range(len(names))
-        bad = {defect.index for defect in find_defects(loader, everything, everything, cameras=True)}
-        return [name for index, name in enumerate(names) if index not in bad]
+        pairs = self.pairs(names)
+        return build_view_batch(pairs, None, *self.size, skip_damaged=True, check_images=True, check_cameras=True).names
 
     def _views(self, names: Sequence[str]) -> ViewBatch:
         frames = [self._load(name) for name in names]

@@ -128,18 +128,17 @@ class CaptureEvaluator:
                 continue
             window, between = capture.window(count)
             context = images.without_defects(window) if window else []
-            targets = [target for target in between if set(capture.neighbours(target).context) <= set(context)]
-            if not targets:
+            triples = [triple for triple in map(capture.neighbours, between) if set(triple.context) <= set(context)]
+            if not triples:
                 continue
-            for target in targets:
-                if target not in pairs:
-                    triple = capture.neighbours(target)
-                    case = images.case(triple.context, [target], self.predictor.depth_range)
-                    pairs[target] = self._triple(case, None).targets[0].scores
-            case = images.case(context, targets, self.predictor.depth_range)
-            before = [context.index(capture.neighbours(target).context[0]) for target in targets]
+            for triple in triples:
+                if triple.target not in pairs:
+                    case = images.case(triple.context, [triple.target], self.predictor.depth_range)
+                    pairs[triple.target] = self._triple(case, None).targets[0].scores
+            case = images.case(context, [triple.target for triple in triples], self.predictor.depth_range)
+            around = [[context.index(name) for name in triple.context] for triple in triples]
             left_out = [name for name in window if name not in context]
-            result.cases[count] = [replace(self._window(case, before, pairs, show), left_out=left_out)]
+            result.cases[count] = [replace(self._window(case, around, pairs, show), left_out=left_out)]
         return result
 
     def predict(self, case: EvalCase) -> Scene:
@@ -174,18 +173,20 @@ class CaptureEvaluator:
         targets = [TargetScores(case.targets.names[0], scores)]
         return CaseScores(case.context.names, targets, _input_psnr(scene.gaussians, case), scene.seconds)
 
-    def _window(self, case: EvalCase, before: Sequence[int], pairs: dict[str, Scores], show: Show | None) -> CaseScores:
+    def _window(
+        self, case: EvalCase, around: Sequence[Sequence[int]], pairs: dict[str, Scores], show: Show | None
+    ) -> CaseScores:
         """Evaluate several views and the held-out frames between them.
 
-        before: for each held-out frame, the context view before it. pairs: each frame's scores from two views.
+        around: for each held-out frame, the context views around it. pairs: each frame's scores from two views.
         """
         scene = self.predict(case)
         targets = []
         for index, name in enumerate(case.targets.names):
             truth, valid = case.targets.image(index), case.targets.valid[index]
             rendering = render_target(scene.gaussians, case.targets, index)
-            around = [before[index], before[index] + 1]
-            scores = {MODEL: self._measure_scene(scene, rendering.rgb, case, index, around), PAIRS: pairs[name][MODEL]}
+            measured = self._measure_scene(scene, rendering.rgb, case, index, around[index])
+            scores = {MODEL: measured, PAIRS: pairs[name][MODEL]}
             scores |= {method: pairs[name][method] for method in (NEAREST, ORACLE_PLANE)}
             targets.append(TargetScores(name, scores))
             if show is not None:

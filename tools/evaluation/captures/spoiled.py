@@ -3,8 +3,8 @@
     python -P -m idesplat.tools.evaluation.captures.spoiled --checkouts DIR
 
 False alarms are counted among all frames of a capture at once, where each can be compared with others, and in pairs of
-a frame and its best partner, alone; in captures of scenes that were moved between the photographs, frames of another
-state than most are no false alarms. Then frames are blurred, blackened, overexposed, or exchanged for others, and are
+a frame and its best partner, alone; in captures whose object was moved between the images, frames of another state
+than most are no false alarms. Then frames are blurred, blackened, overexposed, or exchanged for others, and are
 looked for in a pair with their best partner, beside all other frames and alone.
 """
 
@@ -23,7 +23,7 @@ from ....runtime.cameras.undistortion import shrink
 from ....runtime.cli.terminal import run, say
 from ....runtime.errors import InputError
 from ....runtime.images.colormaps import to_uint8
-from ....runtime.views.checks import CONTRADICTS, find_defects
+from ....runtime.views.checks import Defect, find_defects
 from ....runtime.views.loader import ViewLoader
 from ....runtime.views.selection import PairScorer, guess_scene_depths
 from ..report import print_table
@@ -37,7 +37,7 @@ SIDE = 1024  # pixels: longer side of the images, in whose pixels the blur is gi
 NETWORK_SIZE = 256, 256
 GAMMA = 2.2  # of the display, by which overexposed pixels are found
 NOISE = 3.0  # standard deviation in grey levels, of images that show nothing
-MOVED = ("can",)  # captures whose object was turned or carried between photographs, as their backgrounds show
+MOVED = ("can",)  # captures whose object was moved between the images, as their backgrounds show
 
 
 def count_spoiled(
@@ -65,7 +65,8 @@ def count_spoiled(
                 image, camera = pairs[index]
                 spoiled = spoil(image, pairs[other][0], other_scenes[number % len(other_scenes)])
                 given = [*pairs[:index], (_resized(spoiled, image), camera), *pairs[index + 1 :]]
-                counts[kind][0] += index in _found(given, [index, partner], range(len(given)))
+                beside = _found(given, [index, partner], range(len(given)))
+                counts[kind][0] += index in {defect.index for defect in beside}
                 counts[kind][1] += bool(_found(given, [index, partner], [index, partner]))
                 counts[kind][2] += 1
     say(f"false alarms: {alarms[0]} of {tried} frames beside all others, {alarms[1]} of {tried} in pairs alone")
@@ -100,24 +101,23 @@ def _false_alarms(name: str, pairs: Sequence[Posed], partners: np.ndarray) -> tu
     """How many frames of a good capture are said to be bad: beside all others, and in pairs."""
     everything = range(len(pairs))
     found = _found(pairs, everything, everything)
-    moved = {index for index, what in found.items() if name in MOVED and CONTRADICTS in what}
+    moved = {defect.index for defect in found if name in MOVED and defect.contradicts}
     if moved:
         say(f"{name}: {len(moved)} of {len(pairs)} frames show another state of the scene")
-    beside = set(found) - moved
+    beside = {defect.index for defect in found} - moved
     alone = {index for index in everything if _found(pairs, [index, partners[index]], [index, partners[index]])}
     for index in sorted(beside | alone):
         say(f"{name}, {pairs[index][1].name}: false alarm")
     return len(beside), len(alone)
 
 
-def _found(pairs: Sequence[Posed], chosen: Sequence[int], usable: Sequence[int]) -> dict[int, str]:
-    """The chosen images with defects, and what is wrong with them; all, if they are refused together."""
+def _found(pairs: Sequence[Posed], chosen: Sequence[int], usable: Sequence[int]) -> list[Defect]:
+    """The defects of the chosen images; of all, if they are refused together."""
     loader = ViewLoader(pairs, *NETWORK_SIZE, match=True)
     try:
-        defects = find_defects(loader, sorted(chosen), sorted(usable), cameras=True)
-        return {defect.index: defect.what for defect in defects}
+        return find_defects(loader, sorted(chosen), sorted(usable), cameras=True)
     except InputError as error:
-        return dict.fromkeys(chosen, str(error))
+        return [Defect(index, str(error)) for index in chosen]
 
 
 def _resized(image: np.ndarray, like: np.ndarray) -> np.ndarray:
