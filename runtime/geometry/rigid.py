@@ -1,4 +1,4 @@
-"""Rigid transforms [R t; 0 1]: checks and the inverse."""
+"""Rigid transforms [R t; 0 1]: checks, the inverse, and points moved by them."""
 
 import numpy as np
 
@@ -47,3 +47,9 @@ def invert_rigid(transform: np.ndarray) -> np.ndarray:
     inverse[:3, :3] = transform[:3, :3].T
     inverse[:3, 3] = -transform[:3, :3].T @ transform[:3, 3]
     return inverse
+
+
+def transform_points(transform: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """The points R p + t of a rigid transform [4, 4], in the type that both promote to; points: [..., 3]."""
+    moved: np.ndarray = points @ transform[:3, :3].T + transform[:3, 3]
+    return moved

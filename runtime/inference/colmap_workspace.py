@@ -19,7 +19,7 @@ import numpy as np
 from ..cameras.camera import Camera
 from ..geometry.consistency import DEPTH_TOLERANCE, project_to_view
 from ..geometry.quaternions import matrices_to_quaternions
-from ..geometry.rigid import invert_rigid
+from ..geometry.rigid import invert_rigid, transform_points
 from ..images.colormaps import to_uint8
 from ..images.png import save_png
 from ..splats.points import unproject
@@ -158,7 +158,7 @@ def _image_record(number: int, name: str, camera: Camera, points: np.ndarray, se
     """An image, its pose world-to-camera, and the pixels at which it observes points."""
     pose = invert_rigid(camera.extrinsics)
     (quat,) = matrices_to_quaternions(pose[None, :3, :3])
-    local = points[seen] @ pose[:3, :3].T + pose[:3, 3]
+    local = transform_points(pose, points[seen])
     pixels = (local / local[:, 2:]) @ camera.K.T
     table = np.zeros(len(seen), [("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
     table["x"], table["y"], table["point"] = pixels[:, 0], pixels[:, 1], seen + 1

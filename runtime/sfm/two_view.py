@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from ..geometry.rigid import transform_points
 from .features import parallax_angles, sampson_distance, triangulate
 
 # Variants of RANSAC fail on different inputs; each gives an initial pose, and the one with most inliers is kept.
@@ -96,7 +97,7 @@ def _pose(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
 def _triangulate_inliers(first: np.ndarray, second: np.ndarray, pose: np.ndarray, tolerance: float) -> TwoViewGeometry:
     """The inliers of a pose, and their points."""
     points = triangulate(first, second, pose)
-    in_second = points @ pose[:3, :3].T + pose[:3, 3]
+    in_second = transform_points(pose, points)
     inliers = (sampson_distance(first, second, pose) < tolerance) & (points[:, 2] > 0) & (in_second[:, 2] > 0)
     points = points[inliers]
     angles = parallax_angles(points, -pose[:3, :3].T @ pose[:3, 3])

@@ -4,6 +4,7 @@ from math import ceil
 
 import numpy as np
 
+from ..geometry.rigid import transform_points
 from ..geometry.sh import SH_0
 from .background import find_hidden
 from .gaussians import Gaussians
@@ -41,7 +42,7 @@ def make_backdrop(gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarray, vi
     z = farthest[row, column] * (1 + BEHIND)
     x = ((column + 0.5) * CELL - left - K[0, 2]) / K[0, 0]
     y = ((row + 0.5) * CELL - top - K[1, 2]) / K[1, 1]
-    points = (np.stack([x, y, np.ones_like(x)], axis=-1) * z[:, None]) @ pose[:3, :3].T + pose[:3, 3]
+    points = transform_points(pose, np.stack([x, y, np.ones_like(x)], axis=-1) * z[:, None])
     hidden = np.zeros(len(points), bool)
     find_hidden(points, surfaces.neighbors[view], surfaces.depth, kept, surfaces.viewmats, surfaces.Ks, hidden)
     hidden &= _nearest_camera(points, surfaces.extrinsics) > z / MAGNIFIED

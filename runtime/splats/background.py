@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..geometry.consistency import DEPTH_TOLERANCE, depth_jumps
+from ..geometry.rigid import transform_points
 from ..system.compilation import compiled
 from .gaussians import Gaussians
 from .surfaces import MAX_STEP, Surfaces, project_to_pixel
@@ -25,8 +26,8 @@ def continue_background(gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarr
     smooth = depth_jumps(depth[None])[0] <= MAX_STEP
     _find_sources(depth, surfaces.slopes[view], surfaces.Ks[view], smooth & kept[view], source, continued)
     row, column = np.nonzero(source >= 0)
-    pose = surfaces.extrinsics[view]
-    points = (surfaces.rays(view)[row, column] * continued[row, column, None]) @ pose[:3, :3].T + pose[:3, 3]
+    local = surfaces.rays(view)[row, column] * continued[row, column, None]
+    points = transform_points(surfaces.extrinsics[view], local)
     hidden = np.zeros(len(points), bool)
     find_hidden(points, surfaces.neighbors[view], surfaces.depth, kept, surfaces.viewmats, surfaces.Ks, hidden)
     row, column, points = row[hidden], column[hidden], points[hidden]

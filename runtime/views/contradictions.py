@@ -14,7 +14,7 @@ import numpy as np
 
 from ..geometry.consistency import project_to_view
 from ..geometry.intrinsics import normalize_intrinsics
-from ..geometry.rigid import invert_rigid
+from ..geometry.rigid import invert_rigid, transform_points
 from ..sfm.features import triangulate
 from .loader import FeatureImage
 from .matching import match_along_epipolar_lines
@@ -81,8 +81,7 @@ def _match(images: Sequence[FeatureImage], pairs: Iterable[tuple[int, int]]) -> 
         b_from_a = invert_rigid(b.camera.extrinsics) @ a.camera.extrinsics
         matches = match_along_epipolar_lines(a.inside, b.inside, a.camera.K, b.camera.K, b_from_a, a.match(b))
         if len(matches.first) >= MIN_POINTS:
-            pose = a.camera.extrinsics
-            points = triangulate(matches.first, matches.second, b_from_a) @ pose[:3, :3].T + pose[:3, 3]
+            points = transform_points(a.camera.extrinsics, triangulate(matches.first, matches.second, b_from_a))
             common[view][other] = _Common(matches.first, points)
             common[other][view] = _Common(matches.second, points)
     return common

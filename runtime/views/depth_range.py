@@ -10,7 +10,7 @@ from ..cameras.camera import Camera
 from ..errors import InputError
 from ..geometry.baselines import nearest_neighbor_pairs
 from ..geometry.depth_bounds import MIN_POINTS, depth_bounds
-from ..geometry.rigid import invert_rigid
+from ..geometry.rigid import invert_rigid, transform_points
 from ..sfm.features import Features, parallax_angles, triangulate
 from .loader import FeatureImage
 from .matching import PointMatches, ViewMatcher, match_along_epipolar_lines
@@ -104,7 +104,7 @@ def triangulated_depths(
 def _triangulate(matches: PointMatches) -> tuple[np.ndarray, np.ndarray]:
     """`triangulated_depths` of these matches."""
     points = triangulate(matches.first, matches.second, matches.second_from_first)
-    in_second = points @ matches.second_from_first[:3, :3].T + matches.second_from_first[:3, 3]
+    in_second = transform_points(matches.second_from_first, points)
     angle = parallax_angles(points, invert_rigid(matches.second_from_first)[:3, 3])
     valid = (points[:, 2] > 0) & (in_second[:, 2] > 0) & (angle > MIN_PARALLAX_DEG)
     return points[valid, 2], in_second[valid, 2]

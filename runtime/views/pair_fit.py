@@ -9,7 +9,7 @@ from enum import Enum
 import numpy as np
 
 from ..geometry.baselines import have_baseline
-from ..geometry.rigid import invert_rigid
+from ..geometry.rigid import invert_rigid, transform_points
 from ..sfm.features import EPSILON, match_features, normalize_points, sampson_distance, triangulate
 from ..sfm.two_view import estimate_relative_pose
 from .loader import FEATURE_SIDE, FeatureImage
@@ -120,7 +120,7 @@ def _epipolar_errors(first: np.ndarray, second: np.ndarray, second_from_first: n
     """
     sampson = sampson_distance(first, second, second_from_first)
     points = triangulate(first, second, second_from_first)
-    in_second = points @ second_from_first[:3, :3].T + second_from_first[:3, 3]
+    in_second = transform_points(second_from_first, points)
     at_infinity = np.hstack([first, np.ones((len(first), 1))]) @ second_from_first[:3, :3].T
     end = at_infinity[:, :2] / np.maximum(at_infinity[:, 2:], EPSILON)  # far away if it is behind
     behind = (points[:, 2] <= 0) | (in_second[:, 2] <= 0)

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from ...runtime.geometry.intrinsics import crop_intrinsics, denormalize_intrinsics, scale_intrinsics
-from ...runtime.geometry.rigid import invert_rigid
+from ...runtime.geometry.rigid import invert_rigid, transform_points
 from .layout import Layout, generate_layout
 from .raycast import Scene, cast_rays
 from .textures import Textures, texture_bank
@@ -244,7 +244,7 @@ def _overlap(scene: Scene, poses: np.ndarray, intrinsics: np.ndarray, seen: np.n
     pixels = np.stack([*np.meshgrid(centres, centres), np.ones((PROBE, PROBE))], axis=-1)
     points = pixels @ np.linalg.inv(intrinsics[0]).T * seen[..., None]
     relative = invert_rigid(poses[view]) @ poses[0]
-    projected = (points @ relative[:3, :3].T + relative[:3, 3]) @ intrinsics[view].T
+    projected = transform_points(relative, points) @ intrinsics[view].T
     uv = projected[..., :2] / np.maximum(projected[..., 2:], 1e-6)
     return float(((uv > 0) & (uv < 1)).all(axis=-1).mean())
 
