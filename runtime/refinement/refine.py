@@ -90,12 +90,11 @@ def refine(
         elapsed = (time.perf_counter() - started) / options.seconds
         if elapsed >= 1:
             break
-        done = max(step / options.steps, elapsed)
+        done = max(step / max(options.steps - 1, 1), elapsed)
         if not pruned and done >= PRUNE_AFTER and step >= len(views):  # what no view shows yet, the next may need
             optimiser.prune(options.max_gaussians)
             pruned = True
-        lr = options.final_lr ** max(step / max(options.steps - 1, 1), elapsed)
-        psnr.append(optimiser.step(next(order), lr))
+        psnr.append(optimiser.step(next(order), options.final_lr**done))
         if report is not None and not report(step, psnr[-1]):
             break
     optimiser.prune(options.max_gaussians)

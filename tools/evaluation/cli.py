@@ -21,6 +21,7 @@ from ...runtime.cli.options import (
     QualityOption,
     Quiet,
     Refine,
+    RemoveContradicted,
     Size,
     Threads,
     Verbose,
@@ -211,6 +212,7 @@ def captures(
     quality: QualityOption = None,
     refine: Refine = None,
     exposure: Exposure = ExposureMode.AUTO,
+    remove_contradicted: RemoveContradicted = False,
     model: Model = None,
     provider: Provider = "CPU",
     provider_option: ProviderOption = None,
@@ -224,6 +226,7 @@ def captures(
 ) -> None:
     """Evaluate on real captures at pinned commits of public repositories, cloned where they are not given (git)."""
     from ...runtime.images.png import save_png
+    from ...runtime.splats.filtering import FilterOptions
     from .captures.capture import parse_view_counts
     from .captures.report import print_captures, write_capture_results
     from .evaluate import ModelOn, evaluate_captures
@@ -239,6 +242,7 @@ def captures(
         quality=quality,
         refine=refine,
         exposure=exposure,
+        filters=FilterOptions(remove_contradicted=remove_contradicted),
         size=parse_size(size) if size else None,
         on_target=lambda name, strip: save_png(out / f"{name}{IMAGE}", strip),
     )

@@ -208,14 +208,15 @@ def evaluate_captures(
     quality: Quality | str | None = None,
     refine: str | None = None,
     exposure: str = ExposureMode.AUTO,
+    filters: FilterOptions | None = None,
     on_target: Show | None = None,
 ) -> CaptureEvaluation:
     """Evaluate on real captures at pinned commits of public repositories.
 
     checkouts: a folder of checkouts, each OWNER+NAME or OWNER/NAME; missing ones are cloned into it, or into the user's
     cache if no folder is given. captures: names of some of them instead of all. view_counts: numbers of context views;
-    2 are the triples. quality, refine, exposure: as for `reconstruct`. on_target: receives a name and a strip for each
-    held-out frame.
+    2 are the triples. quality, refine, exposure, filters: as for `reconstruct`. on_target: receives a name and a strip
+    for each held-out frame.
     Raises InputError for unknown captures, and where git or the network fails.
     """
     chosen = read_captures(captures)
@@ -225,7 +226,7 @@ def evaluate_captures(
         predictor.model.check_size(count, *shape)
     folder = checkouts or clones_folder()
     perceptual, warnings = _load_metrics()
-    plan = make_plan(quality, predictor.model, refine, FilterOptions(), 0)
+    plan = make_plan(quality, predictor.model, refine, filters or FilterOptions(), 0)
     evaluator, found = CaptureEvaluator(predictor, perceptual, plan, parse_exposure_mode(exposure)), []
     for capture in progress(chosen, "evaluating"):
         with frames_of(folder, capture) as images:

@@ -17,7 +17,7 @@ from idesplat import Predictor, read_cameras
 from idesplat.runtime.cameras.camera import Camera
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.reconstruction.steps import make_plan
-from idesplat.runtime.splats.filtering import FilterOptions
+from idesplat.runtime.splats.filtering import FilterOptions, filter_gaussians
 from idesplat.runtime.splats.gaussians import Gaussians
 from idesplat.runtime.views.exposure import Exposure
 from idesplat.runtime.views.exposure_mode import ExposureMode
@@ -276,6 +276,34 @@ def test_the_command_gives_the_metrics_of_the_predictor_used_by_hand(
     assert cv2.imread("out/room-3-000-003.png").shape == (64, 4 * 96 + 3 * 4, 3)
     printed = capsys.readouterr().out
     assert "mean of 1" in printed and "wrote out/results.json" in printed
+
+
+def test_contradicted_gaussians_are_left_out_if_asked_for(
+    capture_file: Path, scene: Path, repository: tuple[Path, str], exported: tuple[Path, Path], capsys: Capsys
+) -> None:
+    out = capture_file.parent / "out"
+    options = ("--checkouts", repository[0].parents[1], "--model", exported[0], "--out", out, "--views", "3")
+    assert run_command(main, "captures", *options, "--remove-contradicted") == 0
+    (entry,) = json.loads((out / "results.json").read_text())["captures"]
+    (window,) = entry["cases"]["3"]
+
+    opened = Predictor(exported[0])
+    (capture,) = read_captures()
+    names, held_out = ["000.png", "002.png", "004.png"], ["001.png"]
+    case = CaptureImages(capture, scene / "images", (64, 96)).case(names, held_out, opened.depth_range)
+    context = case.context
+    made = opened.predict_arrays(context.images, context.extrinsics, context.intrinsics, case.near, case.far)
+    kept, removed = filter_gaussians(
+        made.need_gaussians(),
+        made.depth,
+        context.extrinsics,
+        context.intrinsics,
+        FilterOptions(remove_contradicted=True),
+        images=context.images,
+    )
+    assert removed["remove_contradicted"] > 0
+    expected = psnr(render_target(kept, case.targets, 0).rgb, case.targets.image(0), case.targets.valid[0])
+    assert window["targets"][0]["scores"]["model"]["psnr"] == pytest.approx(expected, abs=1e-3)
 
 
 def test_a_render_is_compared_in_the_mean_exposure_of_the_two_views_around() -> None:
