@@ -121,7 +121,7 @@ def test_no_code_of_the_current_folder_runs_in_benchmarks_of_training(tmp_path, 
     sprung = set_traps(tmp_path)
     monkeypatch.chdir(tmp_path)
     phase = next(iter(bench_training.PHASES))
-    measured = bench_training._measure(phase, bench_training.Candidate("idesplat-tiny", "float32", 1, 1), 1)
+    measured = bench_training._measure(phase, bench_training.Candidate("idesplat-tiny", "float32", 1, 1, 1), 1)
     assert measured["scenes"] == 1
     assert not sprung.exists()
 

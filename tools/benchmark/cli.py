@@ -66,7 +66,7 @@ def bench(
     repeats: Annotated[int, typer.Option(help="Rounds.", min=1)] = 7,
     eager: Annotated[bool, typer.Option(help="Run the same networks in eager PyTorch, where it is installed.")] = True,
     training: Annotated[
-        bool, typer.Option("--training", help="Measure training instead: scenes per second of two configurations.")
+        bool, typer.Option("--training", help="Measure training instead: scenes per second of three configurations.")
     ] = False,
     json_path: Json = None,
     compare: Annotated[

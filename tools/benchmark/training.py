@@ -30,21 +30,27 @@ SIZE = 256
 
 @dataclass(frozen=True)
 class Candidate:
-    """A configuration of training."""
+    """A configuration of training. together: scenes of two views that the network takes at once."""
 
     preset: str
     precision: str
     processes: int
     batch: int
+    together: int
 
     @property
     def name(self) -> str:
         """As the table shows it."""
-        return f"{self.preset}, {self.precision}, {self.processes} process(es), {self.batch} scene(s)"
+        scenes = f"{self.batch} scene(s), {self.together} at once"
+        return f"{self.preset}, {self.precision}, {self.processes} process(es), {scenes}"
 
 
-# The first configuration that was trained, and the present one.
-CANDIDATES = (Candidate("idesplat-tiny", "float32", 1, 1), Candidate("idesplat-lite", "bf16", 2, 4))
+# The first configuration that was trained, and present ones: full steps on one scene at a time, or on several at once.
+CANDIDATES = (
+    Candidate("idesplat-tiny", "float32", 1, 1, 1),
+    Candidate("idesplat-lite", "bf16", 2, 4, 1),
+    Candidate("idesplat-lite", "bf16", 2, 16, 4),
+)
 # Step of the run at which a phase begins, by what it trains.
 PHASES = {"128x128, first DPBU": 0, "256x256, everything": 900}
 
@@ -105,14 +111,16 @@ def _other(group: "ProcessGroup", folder: Path, phase: str, candidate: Candidate
 
 def _run_at(folder: Path, phase: str, candidate: Candidate, group: "ProcessGroup") -> "Trainer":
     """A new trainer at the beginning of a phase."""
+    from ..training.options import Resources
     from ..training.settings import TrainingSettings, network_config
     from ..training.trainer import Trainer
 
+    resources = Resources(candidate.processes, together=candidate.together)
     settings = TrainingSettings(
         *(candidate.preset, "both", True, STEPS, candidate.batch, SIZE, 1e-3, 5e-4, 0, "", []),
         precision=candidate.precision,
     )
-    run = Trainer(folder, settings, network_config(settings), group=group)
+    run = Trainer(folder, settings, network_config(settings), group=group, resources=resources)
     run.state.step = PHASES[phase]
     return run
 

@@ -278,7 +278,7 @@ def test_a_json_of_an_older_layout_is_named_in_one_line(tmp_path, capsys):
 
 
 def test_a_failing_training_benchmark_is_one_line():
-    candidate = training.Candidate("no-such-preset", "float32", 1, 1)
+    candidate = training.Candidate("no-such-preset", "float32", 1, 1, 1)
     with pytest.raises(InputError, match=r"no-such-preset.*: its process ended with 1 \(.*no-such-preset") as error:
         training._measure("128x128, first DPBU", candidate, 1)
     assert "\n" not in str(error.value)
