@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..geometry.projection import EPS2D, defocus_variances, project_gaussians
+from ..geometry.rigid import transform_points
 from ..geometry.sh import sh_basis
 from .types import BLOCK_SIZE, MAX_ALPHA, MIN_ALPHA, MIN_LOG_TRANSMITTANCE, SPLAT, GaussianArrays, View
 
@@ -16,7 +17,7 @@ CHUNK_FRAGMENTS = 1 << 18  # composited at once: the temporaries of a chunk fit 
 def project(gaussians: GaussianArrays, start: int, view: View, splats: np.ndarray) -> None:
     """Fill the splats of the block of Gaussians from `start` on; splats: SPLAT [gaussians], zeros."""
     block = GaussianArrays(*(field[start : start + BLOCK_SIZE] for field in gaussians))
-    camera_means = block.means @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]  # [block, 3]
+    camera_means = transform_points(view.viewmat, block.means)  # [block, 3]
     visible = np.flatnonzero((camera_means[:, 2] > view.near) & (block.opacities >= MIN_ALPHA))
     camera_means, block = camera_means[visible], GaussianArrays(*(field[visible] for field in block))
 
