@@ -33,7 +33,7 @@ def sh_basis(directions: Tensor, coefficients: int) -> Tensor:
         basis += [SH_3[3] * z * (2 * z * z - 3 * x * x - 3 * y * y)]
         basis += [-SH_3[2] * x * (4 * z * z - x * x - y * y)]
         basis += [SH_3[4] * z * (x * x - y * y), -SH_3[0] * x * (x * x - 3 * y * y)]
-    return torch.stack(basis, dim=-1)
+    return torch.stack(basis).movedim(0, -1)
 
 
 def sh_rotation(rotation: Tensor, coefficients: int) -> Tensor:

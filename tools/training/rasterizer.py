@@ -122,48 +122,43 @@ def _project(
     width: int,
     height: int,
 ) -> tuple[Tensor, Tensor]:
-    """Means in pixels [gaussians, 2] and 2D covariances (xx, xy, yy) in pixels^2 [gaussians, 3]."""
+    """Means in pixels [gaussians, 2] and 2D covariances (xx, xy, yy) in pixels^2 [3, gaussians]."""
     x, y, z = camera_means.unbind(-1)
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     centres = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
     margin_x, margin_y = FOV_MARGIN * 0.5 * width / fx, FOV_MARGIN * 0.5 * height / fy
     slope_x = torch.clamp(x / z, -cx / fx - margin_x, (width - cx) / fx + margin_x)
     slope_y = torch.clamp(y / z, -cy / fy - margin_y, (height - cy) / fy + margin_y)
-    rotation = viewmat[:3, :3]
-    # Rows of J W, [gaussians, 3].
-    row_u = (fx / z)[:, None] * (rotation[0] - slope_x[:, None] * rotation[2])
-    row_v = (fy / z)[:, None] * (rotation[1] - slope_y[:, None] * rotation[2])
-    axes = _scaled_axes(quats, scales)  # [gaussians, 3, 3]
-    half_u = (row_u[:, :, None] * axes).sum(dim=1)  # [gaussians, 3]
-    half_v = (row_v[:, :, None] * axes).sum(dim=1)
-    xx = (half_u * half_u).sum(dim=-1) + EPS2D
-    xy = (half_u * half_v).sum(dim=-1)
-    yy = (half_v * half_v).sum(dim=-1) + EPS2D
-    return centres, torch.stack([xx, xy, yy], dim=-1)
+    # Gaussians are the last dimension of what follows: PyTorch's loops run along it.
+    right, down, forward = viewmat[:3, :3, None]
+    row_u = (fx / z) * (right - slope_x * forward)  # rows of J W, [3, gaussians]
+    row_v = (fy / z) * (down - slope_y * forward)
+    axes = quaternions_to_matrices(quats).permute(1, 2, 0) * scales.T  # R S, [3, 3, gaussians]
+    half_u = (row_u[:, None] * axes).sum(dim=0)  # [3, gaussians]
+    half_v = (row_v[:, None] * axes).sum(dim=0)
+    xx = (half_u * half_u).sum(dim=0) + EPS2D
+    xy = (half_u * half_v).sum(dim=0)
+    yy = (half_v * half_v).sum(dim=0) + EPS2D
+    return centres, torch.stack([xx, xy, yy])
 
 
 def _conics(covariances: Tensor) -> Tensor:
-    """Inverses (xx, xy, yy) of 2D covariances, [gaussians, 3] each."""
-    xx, xy, yy = covariances.unbind(-1)
+    """Inverses (xx, xy, yy) of 2D covariances [3, gaussians]: [gaussians, 3]."""
+    xx, xy, yy = covariances
     return torch.stack([yy, -xy, xx], dim=-1) / _determinants(covariances)[:, None]
 
 
 def _determinants(covariances: Tensor) -> Tensor:
-    xx, xy, yy = covariances.unbind(-1)
+    xx, xy, yy = covariances
     return xx * yy - xy * xy
 
 
 def _defocus(covariances: Tensor, z: Tensor, K: Tensor, aperture: float, focus: float) -> tuple[Tensor, Tensor]:
-    """2D covariances [gaussians, 3] with the lens's blur, and the factor by which opacities fall, [gaussians]."""
+    """2D covariances [3, gaussians] with the lens's blur, and the factor by which opacities fall, [gaussians]."""
     std = DISC_STD * aperture * (1 / focus - 1 / z)
-    added = torch.stack([(K[0, 0] * std) ** 2, torch.zeros_like(std), (K[1, 1] * std) ** 2], dim=-1)
+    added = torch.stack([(K[0, 0] * std) ** 2, torch.zeros_like(std), (K[1, 1] * std) ** 2])
     blurred = covariances + added
     return blurred, (_determinants(covariances) / _determinants(blurred)).clamp(max=1).sqrt()
-
-
-def _scaled_axes(quats: Tensor, scales: Tensor) -> Tensor:
-    """R S: rotation matrices times scales, [gaussians, 3, 3]."""
-    return quaternions_to_matrices(quats) * scales[:, None, :]
 
 
 def _colours(sh: Tensor, means: Tensor, camera: Tensor) -> Tensor:
@@ -172,7 +167,7 @@ def _colours(sh: Tensor, means: Tensor, camera: Tensor) -> Tensor:
     if count == 1:
         return torch.clamp_min(SH_0 * sh[:, 0] + 0.5, 0)
     basis = sh_basis(torch.nn.functional.normalize(means - camera, dim=-1), count)
-    return torch.clamp_min((basis[:, :, None] * sh).sum(dim=1) + 0.5, 0)
+    return torch.clamp_min((basis.T[:, None] * sh.permute(1, 2, 0)).sum(dim=0).T + 0.5, 0)
 
 
 class _Composite(torch.autograd.Function):

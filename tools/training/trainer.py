@@ -22,6 +22,7 @@ from ...model.idesplat.gaussian_head import HeadInputs
 from ...model.idesplat.network import IDESplat
 from ...runtime.errors import InputError
 from ..synthetic.photo_textures import photo_textures
+from .convolutions import use_channels_last
 from .data.captures import CaptureScenes
 from .data.samples import SampleSpec, TrainingViews, prefetch, prefetch_in_processes
 from .data.synthetic import generate_views
@@ -130,6 +131,8 @@ class Trainer:
         if not resumed:
             self.task.prepare(self.state.model)
             self.state.reset_ema()
+        if resources.device is Device.CPU:
+            use_channels_last(self.state.model)
         if settings.precision == Precision.BF16:
             with_bfloat16(self.state.model)
         self.log = TrainingLog(folder / LOG, self.state.step) if self.group.is_main else None
