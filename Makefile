@@ -50,7 +50,7 @@ check: setup
 
 # The documentation, in site/; every warning is an error.
 docs: setup
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet --site-dir site
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --site-dir site
 
 # Images of a synthetic room to a splat, in demo/.
 demo: setup

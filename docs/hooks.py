@@ -23,7 +23,7 @@ def on_files(files: Files, config: Any) -> Files:
     """Add the generated pages."""
     files.append(File.generated(config, "commands.md", content=command_reference()))
     for page, source in COPIED.items():
-        text = (ROOT / source).read_text(encoding="utf-8").replace("](docs/", "](")
+        text = (ROOT / source).read_text(encoding="utf-8").replace("](docs/", "](").replace("](MODEL_CARD.md)", "](model-card.md)")
         files.append(File.generated(config, page, content=text))
     return files
 

@@ -10,7 +10,7 @@ from ..errors import InputError
 
 NAMED_HASH = re.compile(r"-([0-9a-f]{8})\.pth$")
 DEPTHSPLAT, IDESPLAT = "haofeixu/depthsplat", "hflonglong/IDESplat"
-# The branch of the repositories. Their commits were out of reach while this was written: `--revision` takes one, and
+# The branch of the repositories. Their commits could not be looked up: `--revision` takes one, and
 # the hash in a file's name fixes what it must hold, whatever the commit.
 REVISION = "main"
 
