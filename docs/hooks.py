@@ -23,7 +23,9 @@ def on_files(files: Files, config: Any) -> Files:
     """Add the generated pages."""
     files.append(File.generated(config, "commands.md", content=command_reference()))
     for page, source in COPIED.items():
-        text = (ROOT / source).read_text(encoding="utf-8").replace("](docs/", "](").replace("](MODEL_CARD.md)", "](model-card.md)")
+        text = (ROOT / source).read_text(encoding="utf-8").replace("](docs/", "](")
+        for other_page, other_source in COPIED.items():
+            text = text.replace(f"]({other_source})", f"]({other_page})")
         files.append(File.generated(config, page, content=text))
     return files
 

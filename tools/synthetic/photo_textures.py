@@ -29,14 +29,13 @@ def photo_textures(folder: Path) -> Textures:
     Raises InputError if no crop has enough contrast, or no image can be read.
     """
     paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
-    crops = [(index, crop) for index, path in enumerate(paths) for crop in _crops(path, index)]
-    if not crops:
+    texels = [mip_levels(crop) for index, path in enumerate(paths) for crop in _crops(path, index)]
+    if not texels:
         raise InputError(
             f"{folder}: holds no image with texture that can be read; expected .jpg, .png, .webp or .hdr files"
         )
-    order = np.random.default_rng(len(crops)).permutation(len(crops))[:MAX_TEXTURES]
-    texels = [mip_levels(crops[index][1]) for index in order]
-    return Textures(np.stack(texels), (PHOTO_KIND,) * len(texels))
+    order = np.random.default_rng(len(texels)).permutation(len(texels))[:MAX_TEXTURES]
+    return Textures(np.stack([texels[index] for index in order]), (PHOTO_KIND,) * len(order))
 
 
 def concatenate(first: Textures, second: Textures) -> Textures:

@@ -19,6 +19,7 @@ from .run_files import CHECKPOINT, CURVES, LOG, PREDICTIONS
 
 SECONDS_PER_MINUTE = 60
 MIN_SIDE = 64
+MAX_SEED = 2**63 - 1
 # What the progress bar shows of a step, by its name in the log.
 SHOWN = {"loss": "loss", "abs_rel": "AbsRel", "psnr": "PSNR"}
 
@@ -32,7 +33,7 @@ def train(
         list[Path] | None,
         typer.Option(
             help="Folder with images and transforms.json, instead of synthetic scenes. Every eighth image is held "
-            "out for validation. Can be repeated."
+            "out; where all scenes are captures, validation renders these. Can be repeated."
         ),
     ] = None,
     textures: Annotated[
@@ -69,7 +70,7 @@ def train(
         float,
         typer.Option(help="Highest learning rate of EfficientNet-Lite0; 0 leaves its weights as they are.", min=0),
     ] = 0.0,
-    seed: Annotated[int, typer.Option(help="Random seed of weights and scenes.", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="Random seed of weights and scenes.", min=0, max=MAX_SEED)] = 0,
     perceptual: Annotated[
         PerceptualKind,
         typer.Option(help="Perceptual distance of rendered views: LPIPS (if installed), EfficientNet-Lite0, or none."),
@@ -158,7 +159,7 @@ def train(
             except InputError as missing:
                 warn(f"warning: {missing}")
 
-    with _progress_bar(steps) as on_step:
+    with _progress_bar(steps, quiet) as on_step:
         train_network(
             settings,
             out,
@@ -185,13 +186,13 @@ def _side(text: str) -> int:
 
 
 @contextmanager
-def _progress_bar(steps: int) -> Iterator[Callable[[dict[str, Any]], None]]:
-    """A progress bar on stderr, if that is a terminal; yields what is to be called after each step."""
+def _progress_bar(steps: int, quiet: bool) -> Iterator[Callable[[dict[str, Any]], None]]:
+    """A progress bar on stderr, if that is a terminal and not `quiet`; yields what is to be called after each step."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
+    with Progress(*columns, console=Console(stderr=True), disable=quiet or not sys.stderr.isatty()) as bar:
 
         def on_step(entry: dict[str, Any]) -> None:
             if not bar.tasks:  # a resumed run does not start at 0

@@ -14,12 +14,18 @@ import torch.distributed as dist
 from torch import nn
 
 from ...runtime.errors import InputError
-from ...runtime.system.files import scratch_folder
+from ...runtime.system.files import atomic_write, scratch_folder
 from ..processes import safe_path
 
 # Gloo looks up the host's name, which need not resolve; all processes are on this machine.
 INTERFACE_VARIABLE = "GLOO_SOCKET_IFNAME"
 LOOPBACK = {"linux": "lo", "darwin": "lo0"}
+# Files with the messages of processes that ended with an InputError, by rank.
+ERROR_FILES = "error-*"
+
+
+class ProcessEnded(InputError):
+    """Another process of the group has ended."""
 
 
 class ProcessGroup:
@@ -38,7 +44,7 @@ class ProcessGroup:
         return range(self.rank, batch, self.size)
 
     def all_reduce_gradients(self, parameters: Iterable[nn.Parameter]) -> None:
-        """Sum every gradient over all processes; raises InputError if one of them has ended.
+        """Sum every gradient over all processes; raises ProcessEnded if one of them has ended.
 
         A parameter that has no gradient in any process keeps none.
         """
@@ -55,7 +61,7 @@ class ProcessGroup:
             p.grad = part.view_as(p).to(p.device) if count else None
 
     def gather(self, entries: list[dict[str, float]]) -> list[dict[str, float]]:
-        """The entries of all processes, in the order of ranks; raises InputError if one of them has ended."""
+        """The entries of all processes, in the order of ranks; raises ProcessEnded if one of them has ended."""
         if self.size == 1:
             return entries
         gathered: list[Any] = [None] * self.size
@@ -69,6 +75,7 @@ def spawn_workers(size: int, work: Callable[..., None], *arguments: Any) -> Iter
     """Start the other processes of a group of `size`, of which this one is rank 0; each runs `work(group, *arguments)`.
 
     work: a module-level function, since processes are spawned. They end with this process, even if that is killed.
+    Raises InputError if one of them ends: with its message, if it raised one.
     """
     if size == 1:
         yield
@@ -86,6 +93,10 @@ def spawn_workers(size: int, work: Callable[..., None], *arguments: Any) -> Iter
         _join(0, size, store)
         try:
             yield
+        except ProcessEnded:
+            for error in sorted(folder.glob(ERROR_FILES)):
+                raise InputError(error.read_text(encoding="utf-8")) from None
+            raise
         finally:
             dist.destroy_process_group()
             for process in others:
@@ -94,12 +105,19 @@ def spawn_workers(size: int, work: Callable[..., None], *arguments: Any) -> Iter
 
 
 def _run(rank: int, size: int, store: Path, work: Callable[..., None], arguments: tuple[Any, ...]) -> None:
-    """A process other than rank 0. If rank 0 ends, the next exchange fails, which ends this process."""
+    """A process other than rank 0. If another ends, the next exchange fails, which ends this process.
+
+    The message of an InputError of its own stays in a file beside the store.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all processes; rank 0 handles it
     _join(rank, size, store)
     try:
         work(ProcessGroup(rank, size), *arguments)
-    except InputError:
+    except ProcessEnded:
+        os._exit(1)
+    except InputError as error:
+        with atomic_write(store.with_name(ERROR_FILES.replace("*", str(rank)))) as temporary:
+            temporary.write_text(str(error), encoding="utf-8")
         os._exit(1)
 
 
@@ -111,11 +129,11 @@ def _join(rank: int, size: int, store: Path) -> None:
 
 @contextmanager
 def _peer_errors() -> Iterator[None]:
-    """Raise InputError where gloo reports that a process has ended."""
+    """Raise ProcessEnded where gloo reports that a process has ended."""
     try:
         yield
     except RuntimeError as error:
-        raise InputError(
+        raise ProcessEnded(
             f"a training process ended ({str(error).splitlines()[0]}); repeat the command to resume"
         ) from None
 

@@ -22,8 +22,10 @@ from torch import Tensor
 
 from ...export.pipeline import export_checkpoint
 from ...export.targets import WEB
-from ...model.checkpoint import load_checkpoint
+from ...model.checkpoint import CheckpointError, load_checkpoint
+from ...model.registry import PRESETS
 from ...runtime.cli.terminal import run
+from ...runtime.errors import InputError
 from ...runtime.inference.bundled_model import CHECKSUM_SUFFIX, FOLDER, NAME
 from ...runtime.system.files import atomic_write, make_folder, scratch_folder
 
@@ -38,7 +40,12 @@ def release_bundled_model(
     preset: Annotated[str, typer.Option(help="The network.")] = PRESET,
 ) -> None:
     """Export the mean of the checkpoints' weights as the bundled model."""
-    weights = mean_weights([load_checkpoint(checkpoint, preset).state_dict() for checkpoint in checkpoints])
+    if preset not in PRESETS:
+        raise InputError(f"--preset {preset}: no such preset; choose one of {', '.join(PRESETS)}")
+    try:
+        weights = mean_weights([load_checkpoint(checkpoint, preset).state_dict() for checkpoint in checkpoints])
+    except CheckpointError as error:
+        raise InputError(str(error)) from None
     path = make_folder(FOLDER) / NAME
     with scratch_folder() as folder:
         save_file(weights, folder / WEIGHTS.name)

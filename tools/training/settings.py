@@ -98,5 +98,7 @@ def _check_terms(settings: TrainingSettings) -> None:
         raise InputError(f"{used[0]}: needs Gaussians, which --objective depth does not train; use another objective")
     if settings.pointmaps and not (settings.pm_loss and settings.data):
         raise InputError("--pointmaps: are those of captures for PM-Loss; add --data and --pm-loss, such as 0.005")
-    if settings.aperture and not settings.data:
-        raise InputError("--lens-diameter: is that of captures; add --data")
+    if settings.pm_loss and settings.data and settings.real_ratio == 1 and not settings.pointmaps:
+        raise InputError("--pm-loss: captures have no true points; add --pointmaps, or --real-ratio below 1")
+    if settings.aperture and not (settings.data and settings.real_ratio):
+        raise InputError("--lens-diameter: is that of captures; add --data, with --real-ratio above 0")

@@ -53,8 +53,9 @@ class TrainingState:
     ) -> None:
         """A new network, with random weights of `seed`.
 
-        lr, vit_lr, photo_lr: highest learning rates, of EfficientNet-Lite0 the last; 0 leaves it frozen.
+        lr, vit_lr, photo_lr: highest learning rates, of EfficientNet-Lite0 the last; 0 leaves its parameters frozen.
         trained: prefixes of the names of the trained parameters; the others are frozen. device: where it is trained.
+        Raises InputError if no parameter is trained.
         """
         self.device = torch.device(device)
         self.model = use_training_gather_attention(new_model(config, seed)).to(self.device)
@@ -68,6 +69,8 @@ class TrainingState:
             if parameter.requires_grad:
                 groups[prefix]["params"].append(parameter)
         used = [group for group in groups.values() if group["params"]]
+        if not used:
+            raise InputError(f"--lr {lr:g}: nothing would be trained; give a learning rate above 0")
         self.optimizer = torch.optim.AdamW(used, lr=lr, weight_decay=WEIGHT_DECAY, fused=True)
 
     def start_from(self, path: Path) -> None:

@@ -128,26 +128,29 @@ class Trainer:
         self.task = _task(settings, self.state.model, self.source, features or folder / FEATURES, resources.together)
         self.loaders = resources.loaders
         self.phases = self.task.phases
-        if not resumed:
-            self.task.prepare(self.state.model)
-            self.state.reset_ema()
         if resources.device is Device.CPU:
             use_channels_last(self.state.model)
         if settings.precision == Precision.BF16:
             with_bfloat16(self.state.model)
+        if not resumed:
+            self.task.prepare(self.state.model)
+            self.state.reset_ema()
         self.log = TrainingLog(folder / LOG, self.state.step) if self.group.is_main else None
 
     def fit(self, save_every: float, validate_every: int, on_step: OnStep | None = None) -> None:
-        """Train to the last step. save_every: seconds. validate_every: steps."""
-        saved = time.monotonic()
+        """Train to the last step. save_every: seconds, from the first step on. validate_every: steps."""
+        saved = -math.inf
         samples = self.samples()
         while self.state.step < self.settings.steps:
             entry = self.train_step(samples)
             if self.log is None:
                 continue
-            if self.state.step % validate_every == 0 or self.state.step == self.settings.steps:
-                entry |= self.validate(self.log)
+            validated = self.state.step % validate_every == 0 or self.state.step == self.settings.steps
+            if validated:
+                entry |= self.validate()
             self.log.add(entry)
+            if validated:
+                write_curves(self.folder / CURVES, self.log.entries, PLOTTED)
             if on_step is not None:
                 on_step(entry)
             if time.monotonic() - saved >= save_every:
@@ -196,12 +199,11 @@ class Trainer:
             yield [first, *islice(samples, others)]
             left -= 1 + others
 
-    def validate(self, log: TrainingLog) -> dict[str, Any]:
-        """Metrics of the EMA network on validation scenes at the phase's size; writes predictions and curves."""
+    def validate(self) -> dict[str, Any]:
+        """Metrics of the EMA network on validation scenes at the phase's size; writes their predictions."""
         phase = self.phase(self.state.step - 1)
         side = self.settings.size // phase.downsample
         found = validate(self.state.ema_model(), phase, side, self.held_out, self.folder / PREDICTIONS)
-        write_curves(self.folder / CURVES, log.entries, PLOTTED)
         return {name: finite(value) for name, value in found.items()}
 
     def save(self) -> None:
@@ -221,7 +223,7 @@ def _sources(settings: TrainingSettings, config: IDESplatConfig) -> tuple[Source
     captures = CaptureScenes([Path(folder) for folder in settings.data], config.near, config.far, pointmaps)
     if settings.real_ratio == 1:
         return captures.load, captures.load_held_out
-    return partial(_either, captures.load, synthetic), partial(_either, captures.load_held_out, synthetic)
+    return partial(_either, captures.load, synthetic), synthetic
 
 
 def _either(real: Source, synthetic: Source, spec: SampleSpec) -> TrainingViews:
@@ -236,7 +238,7 @@ def _task(
     size, batch = settings.size, settings.batch
     perceptual = _perceptual(settings, next(model.parameters()).device) if settings.renders else None
     if settings.part == Part.HEAD:
-        description = repr((size, settings.data, settings.textures, HeadInputs._fields))
+        description = repr((size, settings.data, settings.textures, settings.precision, HeadInputs._fields))
         cache = FeatureCache(features, model, source, description)
         return HeadTask(cache, settings.seed, size, batch, settings.scenes, settings.real_ratio, perceptual)
     objective = Objective(settings.objective)
@@ -273,8 +275,15 @@ def _check_resources(resources: Resources, settings: TrainingSettings, config: I
         raise InputError(f"--processes {processes}: more than the {settings.batch} scenes of a step; raise --batch")
     if device is not Device.CPU and head:
         raise InputError(f"--device {device}: --train head runs on the CPU, with cached features; leave out --device")
+    if device is not Device.CPU and (settings.pm_loss or settings.aperture):
+        term = "--pm-loss" if settings.pm_loss else "--lens-diameter"
+        raise InputError(f"--device {device}: {term} is computed on the CPU alone; leave one of them out")
     if device is not Device.CPU and not torch.cuda.is_available():
         raise InputError(f"--device {device}: PyTorch {torch.__version__} finds no such GPU; leave out --device")
+    if resources.together > 1 and settings.data:
+        raise InputError(
+            f"--together {resources.together}: takes synthetic scenes alone; leave out --together or --data"
+        )
     if resources.together > 1 and config.photo is None:
         raise InputError(f"--together {resources.together}: the ViT takes one scene at a time; leave out --together")
     if loaders and processes > 1:

@@ -8,7 +8,7 @@ import pytest
 from idesplat.runtime.errors import InputError
 from idesplat.tools.synthetic.builder import SceneBuilder
 from idesplat.tools.synthetic.layout import LAYOUTS, TRAINING_LAYOUTS
-from idesplat.tools.synthetic.photo_textures import photo_textures
+from idesplat.tools.synthetic.photo_textures import concatenate, photo_textures
 from idesplat.tools.synthetic.sampler import TRAINING_SEEDS, VALIDATION_SEEDS
 from idesplat.tools.synthetic.textures import PHOTO_KIND, SIZE, texture_bank
 from idesplat.tools.training.data.samples import SampleSpec
@@ -47,9 +47,12 @@ def test_folder_without_texture_is_refused(tmp_path: Path) -> None:
 
 
 def test_materials_use_photos_if_there_are_any(folder: Path) -> None:
-    with_photos = SceneBuilder(np.random.default_rng(1), photo_textures(folder))
-    without_photos = SceneBuilder(np.random.default_rng(1), texture_bank(1, 13))
-    assert with_photos.photos == [0, 1] and without_photos.photos == []
+    builder = SceneBuilder(np.random.default_rng(1), concatenate(texture_bank(1, 13), photo_textures(folder)))
+    for _ in range(50):
+        builder.material("brick")
+    photos = [texture in builder.photos for texture, *_ in builder.materials]
+    assert len(builder.photos) == 2 and 0 < sum(photos) < len(photos)
+    assert SceneBuilder(np.random.default_rng(1), texture_bank(1, 13)).photos == []
 
 
 def test_training_scenes_change_and_reported_ones_do_not(folder: Path) -> None:

@@ -24,6 +24,7 @@ from idesplat.tools.training.head import (
 from idesplat.tools.training.initialization import new_model
 from idesplat.tools.training.options import Part
 from idesplat.tools.training.run_files import CHECKPOINT, FEATURES
+from idesplat.tools.training.tasks import HeadTask
 from idesplat.tools.training.trainer import Trainer
 from test_train import SETTINGS, SMALL, finished, logged, one_thread, refused
 
@@ -132,6 +133,17 @@ def test_run_trains_the_head_alone_and_resumes(finished: Path, tmp_path: Path) -
     Trainer(parts, settings, SMALL, features=whole / FEATURES).fit(save_every=1e9, validate_every=4)
     assert logged(parts) == logged(whole)
     assert not (parts / FEATURES).exists()
+
+
+def test_features_of_each_precision_are_cached_apart(finished: Path, tmp_path: Path) -> None:
+    folders = set()
+    for precision in ("float32", "bf16"):
+        settings = replace(HEAD, init=str(finished / CHECKPOINT), precision=precision)
+        (tmp_path / precision).mkdir()
+        task = Trainer(tmp_path / precision, settings, SMALL, features=tmp_path / FEATURES).task
+        assert isinstance(task, HeadTask)
+        folders.add(task.cache.folder)
+    assert len(folders) == 2
 
 
 def test_head_training_needs_a_checkpoint(tmp_path: Path) -> None:

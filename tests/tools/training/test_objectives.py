@@ -118,6 +118,10 @@ def test_true_depth_is_consistent_and_wrong_depth_is_not() -> None:
     assert float(consistency_loss(true, views)) < 0.5 * float(consistency_loss(1.25 * true, views))
     assert match_views(replace(views, images=torch.zeros_like(views.images))) == ()
     assert float(consistency_loss(true, replace(views, matches=((),)))) == 0
+    second_from_first = np.eye(4)
+    second_from_first[0, 3] = -1
+    behind = PointMatches(np.array([[0.0, 0]]), np.array([[0.25, 0]]), second_from_first)  # the rays meet at z = -4
+    assert float(consistency_loss(true, replace(views, matches=(((0, 1, behind),),)))) == 0
 
 
 def scene() -> list[torch.Tensor]:
@@ -215,7 +219,9 @@ def test_a_bad_pointmap_is_named(content: object, expected: str, tmp_path: Path)
         ({"pm_loss": 0.005, "part": "head", "init": "x.ckpt"}, "--pm-loss: trains depth"),
         ({"consistency": 1.0, "objective": "depth"}, "--consistency: needs Gaussians"),
         ({"pointmaps": "maps", "pm_loss": 0.005}, "--pointmaps: are those of captures"),
+        ({"pm_loss": 0.005, "objective": "photometric", "data": ["a"]}, "--pm-loss: captures have no true points"),
         ({"aperture": 0.1}, "--lens-diameter: is that of captures"),
+        ({"aperture": 0.1, "data": ["a"], "real_ratio": 0.0}, "--lens-diameter: is that of captures"),
     ),
 )
 def test_terms_without_effect_are_refused(changes: dict[str, object], expected: str) -> None:

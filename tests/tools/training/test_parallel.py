@@ -14,7 +14,7 @@ import torch
 from idesplat.runtime.errors import InputError
 from idesplat.tools.training import cli
 from idesplat.tools.training.options import Resources
-from idesplat.tools.training.parallel import ProcessGroup, mean_entries
+from idesplat.tools.training.parallel import ProcessGroup, mean_entries, spawn_workers
 from idesplat.tools.training.run_files import CHECKPOINT, LOG
 from idesplat.tools.training.trainer import train
 from test_train import SETTINGS, SMALL
@@ -85,6 +85,15 @@ def _members(group: int) -> bool:
     except ProcessLookupError:
         return False
     return True
+
+
+def _fail(_: ProcessGroup) -> None:
+    raise InputError("frame.jpg: cannot be decoded")
+
+
+def test_the_error_of_another_process_is_that_of_the_run() -> None:
+    with pytest.raises(InputError, match=r"^frame\.jpg: cannot be decoded$"), spawn_workers(2, _fail):
+        ProcessGroup(0, 2).gather([{"loss": 1.0}])
 
 
 def test_ended_process_is_a_one_line_error(monkeypatch: pytest.MonkeyPatch) -> None:

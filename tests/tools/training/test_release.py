@@ -1,13 +1,16 @@
 """The bundled graph and the weights that are kept for it belong together."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 from idesplat.model.checkpoint import load_checkpoint
+from idesplat.runtime.errors import InputError
 from idesplat.runtime.inference.bundled_model import bundled_model
 from idesplat.runtime.inference.predictor import Predictor
 from idesplat.tools.synthetic.sampler import VALIDATION_SEEDS, generate_sample
-from idesplat.tools.training.release import WEIGHTS, mean_weights
+from idesplat.tools.training.release import WEIGHTS, mean_weights, release_bundled_model
 
 SIDE = 64
 TYPICAL = 1e-5  # median error that float32 explains
@@ -25,6 +28,13 @@ def test_the_bundled_graph_computes_what_its_weights_do() -> None:
     assert np.median(np.abs(found.depth / expected.depth.numpy() - 1)) < TYPICAL
     opacities = expected.gaussians.opacities.numpy().ravel()
     assert np.median(np.abs(found.need_gaussians().opacities - opacities)) < TYPICAL
+
+
+def test_unusable_checkpoints_and_presets_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="absent"):
+        release_bundled_model([tmp_path / "absent.ckpt"])
+    with pytest.raises(InputError, match="--preset idesplat-huge: no such preset"):
+        release_bundled_model([WEIGHTS], preset="idesplat-huge")
 
 
 def test_networks_are_averaged_tensor_by_tensor() -> None:

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,11 +14,18 @@ import torch
 from idesplat.model.idesplat.config import PhotoConfig
 from idesplat.model.idesplat.network import IDESplat
 from idesplat.runtime.errors import InputError
-from idesplat.tools.training.data.samples import SampleSpec, prefetch, prefetch_in_processes, stack_scenes
+from idesplat.runtime.images.header import DamagedImage
+from idesplat.tools.training.data.samples import (
+    SampleSpec,
+    TrainingViews,
+    prefetch,
+    prefetch_in_processes,
+    stack_scenes,
+)
 from idesplat.tools.training.data.synthetic import generate_views
 from idesplat.tools.training.gather_attention import use_training_gather_attention
 from idesplat.tools.training.objectives.consistency import with_matches
-from idesplat.tools.training.options import Objective, OptionalTerms, Resources
+from idesplat.tools.training.options import Device, Objective, OptionalTerms, Resources
 from idesplat.tools.training.run_files import CHECKPOINT
 from idesplat.tools.training.schedule import Phase
 from idesplat.tools.training.step import scene_loss
@@ -102,12 +110,26 @@ def test_run_with_loaders_ends_at_the_same_weights(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "options, message",
+    "options, changes, message",
     (
-        ({"together": 2}, "the ViT takes one scene at a time"),
-        ({"loaders": 2, "processes": 2}, "need a single process that trains"),
+        ({"together": 2}, {}, "the ViT takes one scene at a time"),
+        ({"together": 2}, {"data": ["capture"], "real_ratio": 0.5}, "takes synthetic scenes alone"),
+        ({"device": Device.CUDA}, {"pm_loss": 0.005}, "--pm-loss is computed on the CPU alone"),
+        ({"device": Device.CUDA}, {"aperture": 0.02}, "--lens-diameter is computed on the CPU alone"),
+        ({"loaders": 2, "processes": 2}, {}, "need a single process that trains"),
     ),
 )
-def test_options_that_cannot_be_used_are_refused(tmp_path: Path, options: dict[str, int], message: str) -> None:
+def test_options_that_cannot_be_used_are_refused(
+    tmp_path: Path, options: dict[str, Any], changes: dict[str, Any], message: str
+) -> None:
     with pytest.raises(InputError, match=message):
-        train(replace(SETTINGS, batch=2), tmp_path, config=SMALL, resources=Resources(**options))
+        train(replace(SETTINGS, batch=2, **changes), tmp_path, config=SMALL, resources=Resources(**options))
+
+
+def _damaged(spec: SampleSpec) -> TrainingViews:
+    raise DamagedImage(Path("frame.jpg"), "cannot be decoded")
+
+
+def test_the_error_of_a_loader_keeps_its_message() -> None:
+    with pytest.raises(InputError, match=r"^frame\.jpg: cannot be decoded$"):
+        next(prefetch_in_processes([SampleSpec(1, 2, (), 64, 64)], _damaged, 1))

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, replace
+from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -24,7 +25,7 @@ from idesplat.runtime.cameras.camera import Camera
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.views.batch import ViewBatch, build_view_batch
 from idesplat.tools.synthetic.make_scene import make_scene
-from idesplat.tools.training import cli, losses
+from idesplat.tools.training import cli, losses, trainer
 from idesplat.tools.training.data import captures
 from idesplat.tools.training.data.captures import CaptureScenes
 from idesplat.tools.training.data.samples import SampleSpec, prefetch
@@ -268,6 +269,36 @@ def test_resumed_run_equals_uninterrupted(finished: Path, tmp_path: Path) -> Non
         assert torch.equal(ours["training"]["weights"][name], theirs["training"]["weights"][name]), name
 
 
+def test_curves_show_the_last_validation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[list[dict[str, float]]] = []
+    monkeypatch.setattr(trainer, "write_curves", lambda path, entries, names: shown.append(list(entries)))
+    Trainer(tmp_path, replace(SETTINGS, steps=1), SMALL).fit(save_every=1e9, validate_every=4)
+    assert [entry["step"] for entry in shown[-1]] == [1] and "validation_abs_rel" in shown[-1][0]
+
+
+def test_run_stopped_before_the_next_checkpoint_repeats_its_command(tmp_path: Path) -> None:
+    """The first step is saved: without a checkpoint the log would be a file of the user's that would be replaced."""
+
+    def stop(entry: dict[str, float]) -> None:
+        if entry["step"] == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        Trainer(tmp_path, SETTINGS, SMALL).fit(save_every=1e9, validate_every=4, on_step=stop)
+    resumed = Trainer(tmp_path, SETTINGS, SMALL)
+    assert resumed.state.step == 1 and len(logged(tmp_path)) == 1
+
+
+@pytest.mark.parametrize("quiet", (False, True))
+def test_quiet_runs_show_no_progress(quiet: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = StringIO()
+    terminal.isatty = lambda: True  # type: ignore[method-assign]
+    monkeypatch.setattr(sys, "stderr", terminal)
+    with cli._progress_bar(2, quiet) as on_step:
+        on_step({"step": 1, "loss": 3.0})
+    assert ("loss 3.000" in terminal.getvalue()) != quiet
+
+
 def test_checkpoint_holds_the_ema_and_loads_strictly(finished: Path) -> None:
     """The strict loader of the exporter finds the EMA of the weights."""
     model = load_checkpoint(finished / CHECKPOINT, SMALL)
@@ -348,6 +379,7 @@ def test_bad_inputs_are_one_line_each(finished: Path, tmp_path: Path, monkeypatc
     assert "multiple of 64" in refused(out=out, size="200")
     for size in ("64x128", "32", "32x32"):
         assert f"--size {size}: expected a square with sides of 64 pixels at least" in refused(out=out, size=size)
+    assert "nothing would be trained" in refused(out=out, lr=0.0, vit_lr=0.0)
     assert "use photometric" in refused(out=out, data=[tmp_path])
     assert "cannot be read" in refused(out=out, data=[tmp_path], objective=Objective.PHOTOMETRIC)
     assert "no such file" in refused(out=out, init=tmp_path / "absent.ckpt")

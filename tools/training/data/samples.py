@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+from ....runtime.errors import InputError
 from ....runtime.views.matching import PointMatches
 from ...processes import safe_path
 
@@ -96,9 +97,9 @@ def prefetch_in_processes(
 ) -> Iterator[TrainingViews]:
     """The samples of `specs`, in that order, loaded by `processes` processes.
 
-    load: can be pickled.
+    load: can be pickled. An InputError of it is raised here.
     """
-    loader = DataLoader(
+    loader: DataLoader[TrainingViews | InputError] = DataLoader(
         _Samples(specs, load),
         batch_size=None,
         num_workers=processes,
@@ -107,11 +108,22 @@ def prefetch_in_processes(
         worker_init_fn=_ignore_interrupt,
     )
     with safe_path():
-        return iter(loader)
+        return _without_errors(iter(loader))
 
 
-class _Samples(Dataset[TrainingViews]):
-    """The samples of specifications, loaded when they are asked for."""
+def _without_errors(samples: Iterator[TrainingViews | InputError]) -> Iterator[TrainingViews]:
+    """The samples; raises the first error among them."""
+    for sample in samples:
+        if isinstance(sample, InputError):
+            raise sample
+        yield sample
+
+
+class _Samples(Dataset[TrainingViews | InputError]):
+    """The samples of specifications, loaded when they are asked for.
+
+    An InputError takes the place of its sample: raised in a process of `DataLoader`, it would lose its message.
+    """
 
     def __init__(self, specs: Sequence[SampleSpec], load: Callable[[SampleSpec], TrainingViews]) -> None:
         self.specs, self.load = specs, load
@@ -119,8 +131,11 @@ class _Samples(Dataset[TrainingViews]):
     def __len__(self) -> int:
         return len(self.specs)
 
-    def __getitem__(self, index: int) -> TrainingViews:
-        return self.load(self.specs[index])
+    def __getitem__(self, index: int) -> TrainingViews | InputError:
+        try:
+            return self.load(self.specs[index])
+        except InputError as error:
+            return InputError(str(error))
 
 
 def _ignore_interrupt(_: int) -> None:

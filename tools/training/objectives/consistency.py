@@ -51,7 +51,9 @@ def match_views(views: TrainingViews) -> SceneMatches:
 
 
 def consistency_loss(depth: Tensor, views: TrainingViews) -> Tensor:
-    """Mean of both terms over a scene's matches of all pairs of context views; 0 without matches; its mean over scenes.
+    """Mean of both terms over a scene's matches of all pairs of context views; its mean over scenes.
+
+    A scene without matches whose points are in front of both cameras has 0.
 
     depth: predicted z-depth of the context views, [context, H, W]. views: with their matches.
     """
@@ -65,7 +67,7 @@ def consistency_loss(depth: Tensor, views: TrainingViews) -> Tensor:
             matched_loss(depth[first + i], depth[first + j], Ks[first + i], Ks[first + j], matches)
             for i, j, matches in of_scene
         ]
-        if losses:
+        if any(len(of_pair) for of_pair in losses):
             total = total + torch.cat(losses).mean()
     return total / views.scenes
 
