@@ -53,4 +53,5 @@ def quaternions_to_matrices(quats: Tensor) -> Tensor:
         *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
         *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     ]
+    # In memory each entry's values follow each other, along which PyTorch's loops are fastest.
     return torch.stack(rows).unflatten(0, (3, 3)).movedim((0, 1), (-2, -1))

@@ -33,6 +33,7 @@ def sh_basis(directions: Tensor, coefficients: int) -> Tensor:
         basis += [SH_3[3] * z * (2 * z * z - 3 * x * x - 3 * y * y)]
         basis += [-SH_3[2] * x * (4 * z * z - x * x - y * y)]
         basis += [SH_3[4] * z * (x * x - y * y), -SH_3[0] * x * (x * x - 3 * y * y)]
+    # In memory each function's values follow each other, along which PyTorch's loops are fastest.
     return torch.stack(basis).movedim(0, -1)
 
 
