@@ -55,6 +55,12 @@ def write_cameras(path: Path, cameras: Sequence[Camera]) -> None:
     writer.write(path, cameras)
 
 
+def check_writable(path: Path, cameras: Sequence[Camera]) -> None:
+    """Raise InputError if `write_cameras` could not represent a camera in the format of this file."""
+    if path.name == transforms.FILE_NAME:
+        transforms.check_writable(cameras)
+
+
 def detect_format(path: Path) -> CameraFormat:
     """The format of a file or folder of cameras, from its content. Raises InputError if none fits."""
     source = CameraSource(Path(path))

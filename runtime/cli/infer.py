@@ -153,6 +153,12 @@ def infer(
     session = session_config(threads, device, provider_option)
     given = [*(images or []), *(photos or [])]
     found = _find_cameras(given, cameras)
+    if focal and found.cameras is not None:
+        raise InputError(
+            f"--focal {focal}: is for estimated cameras, and those of {found.cameras} are used; leave it out"
+        )
+    if crop and size:
+        raise InputError("--crop and --size: both give the size to work at; leave one of them out")
     targets = Targets(
         out or _named_after(given), save_depth, depth_format, render, save_cameras, report, json_path, found
     )
@@ -170,6 +176,8 @@ def infer(
     files = read_model(model)
     targets.check_model(files, filters)
     surface = is_mesh(targets.out)
+    if surface or not files.metadata.gaussians:
+        _refuse_refinement(targets.out, refine, max_gaussians)
     with StopOnInterrupt() as on_step:
         result = reconstruct(
             given,
@@ -218,13 +226,20 @@ def _find_cameras(images: list[Path], cameras: str | None) -> "Found":
     return Found(images, None if cameras == ESTIMATE else Path(cameras), "")
 
 
+def _refuse_refinement(out: Path, refine: str | None, max_gaussians: int) -> None:
+    """Raise InputError for options of Gaussians where the output has none."""
+    for option, asked in {"--refine": refine not in (None, "0"), "--max-gaussians": max_gaussians}.items():
+        if asked:
+            raise InputError(f"{option}: changes Gaussians, and {out} is made from depth; leave it out")
+
+
 def _named_after(images: list[Path]) -> Path:
     """The file of splats in the current folder that is named after the folder of the images, or the video."""
     if not images:
         raise InputError("--out: expected the file to write, such as scene.ply, where --cameras name the images")
-    from ..images.finding import is_video
+    from ..images.finding import first_match, is_video
 
-    first = images[0]
+    first = first_match(images[0])
     if not first.is_dir() and is_video(first):
         return Path(first.stem + SPLATS)
     folder = first if first.is_dir() else first.parent

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from ..cameras.discovery import Found
+from ..cameras.io import check_writable
 from ..errors import InputError
 from ..inference.depth_format import DepthFormat
 from ..inference.inputs import Inputs
@@ -90,6 +91,8 @@ class Targets:
         """Register the files named after the chosen views; raises InputError as `announce`."""
         run = outputs()
         run.reads("an image", inputs.images)
+        if self.save_cameras is not None:
+            check_writable(self.save_cameras, inputs.cameras)
         if self.found.cameras is not None:
             run.reads("an image", named_images(self.found.cameras, inputs.cameras))
         if self.save_depth is not None:

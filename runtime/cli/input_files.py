@@ -44,6 +44,17 @@ def given_images(given: Sequence[str | Path]) -> list[Path]:
     return found
 
 
+def with_cameras(images: list[Path], cameras: Sequence["Camera"]) -> list[Path]:
+    """The images that a camera names; how many are left out is noted, such as those that could not be registered."""
+    from ..views.batch import images_with_cameras
+    from .reporting import note
+
+    found = images_with_cameras(images, cameras)
+    if len(found) < len(images):
+        note(f"note: {len(images) - len(found)} of {len(images)} images have no camera; left out")
+    return found
+
+
 def named_images(path: Path, cameras: Iterable["Camera"]) -> list[Path]:
     """The images that cameras name, as paths beside their file; they need not exist.
 

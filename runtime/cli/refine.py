@@ -1,5 +1,6 @@
 """The command `idesplat refine`: a splat file fitted to the images of its scene."""
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -63,7 +64,7 @@ def refine(
 
     Ctrl-C ends the refinement and writes what it has reached.
     """
-    from ..cameras.io import write_cameras
+    from ..cameras.io import check_writable, write_cameras
     from ..refinement.options import POSE_LR, RefinementOptions
     from ..refinement.poses import refined_cameras
     from ..refinement.refine import refine as fit
@@ -79,6 +80,8 @@ def refine(
     gaussians, offset = read_splats(scene), read_offset(scene)
     with scratch_folder() as folder:
         found, views = _read_views(cameras, camera_format, images or [], offset, max_side, folder)
+    if refine_poses:
+        check_writable(refine_poses, found)
     options = RefinementOptions(
         steps or STANDARD.steps(len(views)),
         seed=seed,
@@ -87,16 +90,18 @@ def refine(
     )
     with StopOnInterrupt() as on_step:
         refined = fit(gaussians, views, options, on_step)
+    first, last = refined.mean_psnr()
+    if math.isnan(first):
+        raise InputError(f"{cameras}: none of {refined.steps} images shows the scene; give the cameras of its world")
     if on_step.stopped:
         note(f"stopped after {refined.steps} of {options.steps} steps")
     for line in write_splats(out, refined.gaussians, offset):
         note(f"note: {line}")
     if refine_poses:
         write_cameras(refine_poses, refined_cameras(found, refined.viewmats, offset))
-    first, last = refined.psnr[: len(views)], refined.psnr[-len(views) :]
     say(
         f"wrote {out}: {len(refined.gaussians):,} Gaussians, {refined.steps} steps on {len(views)} images, their PSNR "
-        f"{sum(first) / len(first):.2f} dB in the first round and {sum(last) / len(last):.2f} dB in the last"
+        f"{first:.2f} dB in the first round and {last:.2f} dB in the last"
     )
     if refine_poses:
         say(f"wrote {refine_poses}: {len(found)} cameras with refined poses")
@@ -131,9 +136,11 @@ def _read_views(
     from ..refinement.views import load_posed_images
     from ..views.batch import match_images_to_cameras
     from ..views.sources import find_input_images
+    from .input_files import with_cameras
 
     files = find_input_images(images, cameras, form, folder)
-    pairs = match_images_to_cameras(files, read_cameras(cameras, files, form))
+    every = read_cameras(cameras, files, form)
+    pairs = match_images_to_cameras(with_cameras(files, every), every)
     found = [camera for _, camera in pairs]
     placed = zip(pairs, offset_cameras(found, offset), strict=True)
     return found, load_posed_images([(file, camera) for (file, _), camera in placed], max_side)

@@ -106,13 +106,15 @@ def render(
     """
     colour = _parse_background(background)
     lens = _parse_lens(aperture, focus)
-    if not 0 < fps <= 1000:
+    if not 1 <= fps <= 1000:
         raise InputError(f"--fps {fps:g}: expected frames a second, 1 to 1000")
     if not 1 <= frames <= MAX_FRAMES:
         raise InputError(f"--frames {frames}: expected 1 to {MAX_FRAMES} images")
     _check_out(out)
     if path and orbit:
         raise InputError("--path and --orbit: expected one of them")
+    if degrees is not None and not orbit:
+        raise InputError(f"--degrees {degrees:g}: is of the orbit; add --orbit")
     views = read_cameras(cameras, camera_format=camera_format) if cameras else []
     if path and not views:
         raise InputError("--path: needs the cameras that it leads through; give --cameras, or use --orbit")
@@ -229,7 +231,9 @@ def _choose_cameras(
         return path_cameras(views, frames)
     if orbit:
         centre = list(views) or [overview_camera(gaussians, *parse_size(size or SIZE))]
-        return orbit_cameras(gaussians, centre, degrees or (CAMERA_ORBIT_DEG if views else SCENE_ORBIT_DEG), frames)
+        if degrees is None:
+            degrees = CAMERA_ORBIT_DEG if views else SCENE_ORBIT_DEG
+        return orbit_cameras(gaussians, centre, degrees, frames)
     return list(views) or [overview_camera(gaussians, *parse_size(size or SIZE))]
 
 

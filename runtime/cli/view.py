@@ -128,6 +128,7 @@ def read_viewpoints(cameras: Path | None, form: CameraFormat | None, images: lis
     from ..viewer.viser_scene import Viewpoint
     from ..views.batch import match_images_to_cameras
     from ..views.sources import find_input_images
+    from .input_files import with_cameras
 
     if cameras is None:
         return []
@@ -138,7 +139,8 @@ def read_viewpoints(cameras: Path | None, form: CameraFormat | None, images: lis
         ]
     with scratch_folder() as folder:
         files = find_input_images(images, cameras, form, folder)
-        pairs = match_images_to_cameras(files, read_cameras(cameras, files, form))
+        every = read_cameras(cameras, files, form)
+        pairs = match_images_to_cameras(with_cameras(files, every), every)
         return [_viewpoint(file, camera) for file, camera in progress(pairs, "reading images")]
 
 

@@ -40,6 +40,11 @@ def find_images(given: Sequence[str | Path]) -> list[Path]:
     return sorted({os.path.abspath(path): path for path in reversed(found)}.values(), key=_natural)
 
 
+def first_match(item: Path) -> Path:
+    """The first file of a glob, in natural order; what exists, or matches nothing, as it is."""
+    return item if item.exists() else min(map(Path, glob.glob(str(item))), key=_natural, default=item)
+
+
 def image_stem(path: PurePath) -> str:
     """The file name without the suffix of an image format; other suffixes, as in `r_0.5`, are kept."""
     return path.stem if path.suffix.lower() in SUFFIXES else path.name

@@ -40,7 +40,7 @@ def extract_named_frames(video: Path, names: Sequence[str], folder: Path) -> lis
     """Write the frames that cameras name to a folder, at most FRAMES, evenly spaced, under the names in `names`.
 
     A name is `<video>-<number>`, as `extract_sharp_frames` names files, or a time in microseconds, as in RealEstate10K.
-    Raises InputError if the video cannot be read or no name is of these kinds.
+    Raises InputError if the video cannot be read or has none of the frames, or no name is of these kinds.
     """
     rate = _frame_rate(video)
     name_of = {number: f"{_stem(name)}.png" for name in names if (number := _number(name, video, rate)) is not None}
@@ -51,7 +51,13 @@ def extract_named_frames(video: Path, names: Sequence[str], folder: Path) -> lis
         )
     spread = np.linspace(0, len(name_of) - 1, min(FRAMES, len(name_of))).round().astype(int)
     taken = [sorted(name_of)[index] for index in spread]
-    return _write_frames(video, {number: name_of[number] for number in taken}, folder)
+    written = _write_frames(video, {number: name_of[number] for number in taken}, folder)
+    if not written:
+        raise InputError(
+            f"{video}: has none of the {len(name_of)} frames that the cameras name, such as {name_of[taken[0]]}; "
+            "give the video that the cameras were made for, or --cameras estimate"
+        )
+    return written
 
 
 def _write_frames(video: Path, name_of: Mapping[int, str], folder: Path) -> list[Path]:

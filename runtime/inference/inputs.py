@@ -3,7 +3,7 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from ..sfm.estimate import describe_estimate, estimate_cameras
 from ..system.files import scratch_folder
 from ..system.limits import parse_whole_number
 from ..system.progress import working
-from ..views.batch import ViewBatch, build_view_batch, match_images_to_cameras
+from ..views.batch import ViewBatch, build_view_batch, images_with_cameras, match_images_to_cameras
 from ..views.loader import ImageCameraPair
 from ..views.selection import MIN_VIEWS
 from ..views.sources import find_input_images
@@ -150,7 +150,7 @@ def _posed_images(request: Request, model: ModelFiles, folder: Path) -> _PosedIm
         with working("reading cameras"):
             cameras = read_cameras(Path(given), images, request.camera_format)
     if found is not None and request.select is None:
-        images = _with_a_camera(images, cameras)
+        images = images_with_cameras(images, cameras)
         if len(images) < len(files):
             notes.append(f"{len(files) - len(images)} of {len(files)} images have no camera in {path}; left out")
     images = select_images(images, request.select)
@@ -183,12 +183,6 @@ def _with_estimated_cameras(request: Request, model: ModelFiles, files: list[Pat
     notes = [*skipped, describe_estimate(len(images) - len(skipped), cameras)]
     pairs = match_images_to_cameras([Path(camera.name) for camera in cameras], cameras)
     return _PosedImages([(decoded.get(path, path), camera) for path, camera in pairs], wanted, files, ESTIMATE, notes)
-
-
-def _with_a_camera(images: Sequence[Path], cameras: Sequence[Camera]) -> list[Path]:
-    """The images that a camera names; all, if none is named."""
-    named = {image_stem(PurePosixPath(camera.name.replace("\\", "/"))) for camera in cameras}
-    return [image for image in images if image_stem(image) in named] or list(images)
 
 
 def _named_without(folder: Path, image: Path | np.ndarray, camera: Camera) -> Camera:
@@ -238,7 +232,7 @@ def _view_count(request: Request, model: ModelFiles, images: int) -> int | None:
     """How many views to use; None for all. Raises InputError where the model does not take as many."""
     asked = parse_views(request.views) if isinstance(request.views, str) else request.views
     if asked == ALL:
-        return model.view_count(None, images, None)
+        return model.view_count(None, images, None, f"--views {ALL}")
     return model.view_count(int(asked) if asked else None, images if request.select else None, request.default_views)
 
 

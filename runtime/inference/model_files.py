@@ -45,11 +45,13 @@ class ModelFiles:
         turn = upright and own.width > own.height and not own.fixed_size
         return (own.width, own.height) if turn else (own.height, own.width)
 
-    def view_count(self, asked: int | None, named: int | None, default: int | None) -> int | None:
+    def view_count(
+        self, asked: int | None, named: int | None, default: int | None, naming: str = "--select"
+    ) -> int | None:
         """How many views to use; None for all.
 
-        asked: by --views. named: how many images --select names. default: where neither is given, and the model takes
-        any number.
+        asked: by --views. named: how many images the option `naming` names. default: where neither is given, and the
+        model takes any number.
         Raises InputError where the model was exported for a number of views, and another is asked for.
         """
         fixed = self.metadata.fixed_views
@@ -59,7 +61,7 @@ class ModelFiles:
             raise InputError(f"--views {asked}: {self._fixed()}; use --views {fixed}, or export without --views")
         if named is not None and (named < fixed or (named > fixed and asked is None)):
             more = "" if named < fixed else f", or add --views {fixed} to have the best of them chosen"
-            raise InputError(f"--select names {named} images: {self._fixed()}; name {fixed}{more}")
+            raise InputError(f"{naming} names {named} images: {self._fixed()}; name {fixed}{more}")
         return fixed
 
     def check_size(self, views: int, height: int, width: int) -> None:

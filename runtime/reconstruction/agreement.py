@@ -35,6 +35,7 @@ class Agreement:
         self.views = views
         points = np.stack([self._points(view, surface) for view, surface in enumerate(depth)])
         self.surfaces = Surfaces(points, depth, views.extrinsics, views.intrinsics, views.images, neighbors)
+        self.colors = self.surfaces.color_ranges  # found here, before several threads ask for it
         self.nearest = np.stack([cv2.erode(surface, SQUARE) for surface in self.surfaces.depth])
         self.farthest = np.stack([cv2.dilate(surface, SQUARE) for surface in self.surfaces.depth])
 
@@ -53,7 +54,7 @@ class Agreement:
     def score(self, view: int, depth: np.ndarray) -> np.ndarray:
         """The share of the votes for each pixel's depth, float32 [height, width]."""
         s = self.surfaces
-        colors, least, most = s.color_ranges
+        colors, least, most = self.colors
         score = np.empty(depth.shape, np.float32)
         of_view = self._points(view, depth), colors[view], s.neighbors[view]
         _vote(*of_view, self.nearest, self.farthest, s.viewmats, s.Ks, least, most, score)

@@ -1,5 +1,6 @@
 """The result of a reconstruction, and its output files."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -156,7 +157,8 @@ class Reconstruction:
 
     def _refinement(self) -> dict[str, Any]:
         """The number of steps, the PSNR of the last ones, and the exposure of each view that was found beside."""
-        found = {"steps": len(self.psnr), "psnr": self.psnr[-len(self.views.names) :]}
+        last = [None if math.isnan(psnr) else psnr for psnr in self.psnr[-len(self.views.names) :]]
+        found = {"steps": len(self.psnr), "psnr": last}
         if self.refined_exposure is None:
             return found
         return found | self.refined_exposure.as_lists()

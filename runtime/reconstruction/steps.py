@@ -4,8 +4,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
 from ..errors import InputError
 from ..inference.model_files import ModelFiles
 from ..inference.predictor import Prediction
@@ -125,7 +123,7 @@ def refine_prediction(
     seconds = time.perf_counter() - started
     notes = []
     if refined.steps:
-        first, last = (float(np.mean(part)) for part in (refined.psnr[: len(images)], refined.psnr[-len(images) :]))
+        first, last = refined.mean_psnr()
         notes.append(
             f"refined in {refined.steps} steps, {seconds:.0f} s: PSNR of the input views {first:.1f} to {last:.1f} dB"
         )

@@ -2,6 +2,9 @@
 
 import numpy as np
 
+# The contribution of a Gaussian that no view had in sight: less than of any that a view shows, but not nothing.
+UNSEEN = np.finfo(np.float64).tiny
+
 
 class Contributions:
     """The sum of alpha T over the pixels of the views, one view a step, in rounds of all views.
@@ -15,9 +18,9 @@ class Contributions:
 
     @property
     def total(self) -> np.ndarray:
-        """Of the last round, if it is not the first, complete; infinite where no view had a Gaussian in sight."""
+        """Of the last round, if it is not the first, complete; UNSEEN where no view had a Gaussian in sight."""
         latest = self._round if self._round.steps == self.views or not self._last.steps else self._last
-        return np.where(latest.seen, latest.total, np.inf)
+        return np.where(latest.seen, latest.total, UNSEEN)
 
     def add(self, weights: np.ndarray, seen: np.ndarray) -> None:
         """Add a view: the Gaussians' weights in it, and whether it has them in sight, both [gaussians]."""

@@ -52,8 +52,9 @@ class PosedImage:
 class Refined:
     """A refined scene.
 
-    psnr: of the views before their step, one for each step. gains, offsets: of each view and channel, [views, 3]: an
-    image is gain * render + offset. viewmats: of the views, refined if asked for, [views, 4, 4].
+    psnr: of the views before their step, one for each step; NaN of a view that has no pixel to fit. gains, offsets: of
+    each view and channel, [views, 3]: an image is gain * render + offset. viewmats: of the views, refined if asked for,
+    [views, 4, 4].
     """
 
     gaussians: Gaussians
@@ -66,6 +67,12 @@ class Refined:
     def steps(self) -> int:
         """Steps that were made."""
         return len(self.psnr)
+
+    def mean_psnr(self) -> tuple[float, float]:
+        """The means of the first and of the last step of each view; NaN where no view has a pixel to fit."""
+        views = len(self.viewmats)
+        first, last = self.psnr[:views], self.psnr[-views:]
+        return _mean_of_known(first), _mean_of_known(last)
 
 
 def refine(
@@ -140,10 +147,12 @@ class Optimiser:
     def prune(self, limit: int) -> None:
         """Keep the Gaussians that contribute most, at most `limit` or any number for 0.
 
-        None that adds nothing, and none below the least opacity of the options.
+        None that adds nothing, and none below the least opacity of the options. Views that had no turn yet are rendered
+        for it: what they alone show stays.
         """
-        if not self.steps:
-            for view in progress(self.views, "finding what contributes"):
+        if self.steps < len(self.views):
+            waiting = [view for view, visits in zip(self.views, self.exposure_adam.visits, strict=True) if not visits]
+            for view in progress(waiting, "finding what contributes"):
                 done = self.rasterizer.forward(view.target)
                 self._add_contributions(done, self.rasterizer.backward(done, np.zeros_like(done.rgb)))
         total = self.contributions.total
@@ -239,7 +248,14 @@ def _view_order(views: int, seed: int) -> Iterator[int]:
         yield from generator.permutation(views).tolist()
 
 
+def _mean_of_known(values: Sequence[float]) -> float:
+    return float(np.mean([value for value in values if not np.isnan(value)] or [np.nan]))
+
+
 def _psnr(image: np.ndarray, view: PosedImage) -> float:
+    """Over the pixels that are fitted; NaN where there is none."""
     weights = view.weights
-    error = float((np.square(image - view.image) * weights).sum()) / max(3 * float(weights.sum()), 1.0)
+    if not weights.any():
+        return float("nan")
+    error = float((np.square(image - view.image) * weights).sum()) / (3 * float(weights.sum()))
     return -10 * float(np.log10(error + 1e-12))

@@ -16,6 +16,9 @@ from .holes import close_holes
 from .merging import find_duplicates, merge_gaussians
 from .surfaces import Surfaces
 
+# The filter that is part of fusion, and no option.
+REDUNDANT = "remove_redundant"
+
 
 @dataclass(frozen=True)
 class FilterOptions:
@@ -77,7 +80,8 @@ def filter_gaussians(
 
     gaussians: one for each pixel, ordered by view, row, column. depth: z-depth, [views, height, width]. extrinsics:
     camera-to-world, OpenCV axes, [views, 4, 4]. intrinsics: normalised by width and height, [views, 3, 3]. voters: the
-    views that may contradict or confirm each view, as arrays of indices; by default all others. images: RGB in [0, 1],
+    views that may contradict each view, as arrays of indices; by default all others. `min_consistency` asks all.
+    images: RGB in [0, 1],
     [views, 3, height, width], for votes by colour.
     Raises InputError if a border is wider than the images, or no Gaussian is left.
     """
@@ -108,7 +112,8 @@ def filter_gaussians(
                 continue  # it adds some: after all others
         removed[name] = before - int(kept.sum())
     if not kept.any():
-        raise InputError(f"{', '.join(map(_option, removed))}: no Gaussian is left of {kept.size}; filter less")
+        named = [_option(name) for name in removed if name != REDUNDANT] or ["fusion"]
+        raise InputError(f"{', '.join(named)}: no Gaussian is left of {kept.size}; filter less")
     if options.close_holes:
         return close_holes(gaussians, surfaces, kept), removed
     return gaussians.select(kept.ravel()), removed

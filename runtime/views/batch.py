@@ -98,6 +98,12 @@ def match_images_to_cameras(images: Sequence[Path], cameras: Sequence[Camera]) -
     return pairs
 
 
+def images_with_cameras(images: Sequence[Path], cameras: Sequence[Camera]) -> list[Path]:
+    """The images that a camera names; all, if none is named."""
+    named = {image_stem(_path(camera.name)) for camera in cameras}
+    return [image for image in images if image_stem(image) in named] or list(images)
+
+
 def build_view_batch(
     pairs: Sequence[ImageCameraPair],
     count: int | None,

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from idesplat.export import cli as export
 from idesplat.export.released import cli as pull
 from idesplat.runtime.cameras.io import write_cameras
-from idesplat.runtime.cli import batch, convert, infer, models, render, view, web
+from idesplat.runtime.cli import batch, convert, infer, models, refine, render, view, web
 from idesplat.runtime.cli import cameras as convert_cameras
 from idesplat.runtime.errors import printable
 from idesplat.runtime.inference.metadata import StageFile, write_manifest
@@ -84,6 +84,13 @@ COMMANDS = {
         "scene.ply --orbit --frames 2 --out out --size 16x24 --depth --degrees 20",
         ("scene.ply",),
         15,
+    ),
+    "refine": Command(
+        refine.refine,
+        refine.main,
+        f"scene.ply {IMAGES} --out out/a.ply --steps 2 --max-side 48",
+        ("scene.ply", *POSED),
+        10,
     ),
     "convert": Command(convert.convert, convert.main, "scene.ply out/a.splat --min-opacity 0.1", ("scene.ply",), 40),
     "cameras": Command(

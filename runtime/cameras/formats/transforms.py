@@ -73,6 +73,12 @@ def read(path: Path, images: Sequence[Path] = ()) -> list[Camera]:
     return cameras
 
 
+def check_writable(cameras: Sequence[Camera]) -> None:
+    """Raise InputError if a camera has more distortion coefficients than the format allows."""
+    for camera in cameras:
+        _frame(camera)
+
+
 def write(path: Path, cameras: Sequence[Camera]) -> None:
     """Write a transforms.json with intrinsics in every frame.
 

@@ -12,7 +12,7 @@ import pytest
 import trimesh
 from conftest import run_command
 from idesplat.runtime.cameras.io import read_cameras
-from idesplat.runtime.cli.infer import main
+from idesplat.runtime.cli.infer import _named_after, main
 from idesplat.runtime.cli.render import main as render_main
 from idesplat.runtime.cli.view import main as view_main
 from idesplat.runtime.inference.inputs import select_images
@@ -244,6 +244,17 @@ def test_neither_images_nor_a_name_to_write(workplace, capsys):
     assert "--out: expected the file to write" in capsys.readouterr().err
 
 
+def test_a_crop_of_another_size_is_refused(workplace, capsys):
+    assert run_command(main, *USUAL, "--crop", "--size", "64x96") == 2
+    assert "--crop and --size: both give the size" in capsys.readouterr().err
+
+
+def test_scenes_of_a_glob_are_named_after_the_folder_of_its_first_match(workplace):
+    shutil.copytree("images", "photos/desk")
+    assert _named_after([Path("photos/*/*.png")]) == Path("desk.ply")
+    assert _named_after([Path("photos/desk")]) == Path("desk.ply")
+
+
 def test_images_alone(workplace, tmp_path_factory, capsys):
     folder = tmp_path_factory.mktemp("larger")
     make_scene(folder, seed=2, views=2, height=240, width=320)
@@ -351,6 +362,17 @@ BAD = {
         ("--out", "scene.mesh.ply", "--min-opacity", "0.1"),
         "a surface knows --max-depth-jump alone",
     ),
+    "a surface with refined splats": (
+        nothing,
+        ("--out", "a.mesh.ply", "--refine", "10"),
+        "--refine: changes Gaussians",
+    ),
+    "a surface with few splats": (
+        nothing,
+        ("--out", "a.mesh.ply", "--max-gaussians", "9"),
+        "--max-gaussians: changes Gaussians",
+    ),
+    "a focal length beside cameras": (nothing, ("--focal", "26mm"), "--focal 26mm: is for estimated cameras"),
     "a border wider than the images": (nothing, ("--crop-border", "32"), "--crop-border 32"),
     "an output that is no splat file": (nothing, ("--out", "scene.txt"), ".ply"),
     "an output folder that is a file": (nothing, ("--save-depth", "transforms.json"), "transforms.json"),

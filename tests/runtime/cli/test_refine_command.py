@@ -2,13 +2,14 @@
 
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from conftest import run_command
 from idesplat.runtime.cameras.camera import Camera
-from idesplat.runtime.cameras.io import read_cameras
+from idesplat.runtime.cameras.io import read_cameras, write_cameras
 from idesplat.runtime.cli.refine import main
 from idesplat.runtime.splats.formats.ply import write_ply
 from idesplat.runtime.splats.gaussians import Gaussians, with_colours
@@ -55,6 +56,34 @@ def test_writes_refined_poses(folder: Path, capsys: pytest.CaptureFixture[str]) 
         assert refined.name == given.name
         np.testing.assert_array_equal(refined.K, given.K)
         assert 0 < np.abs(refined.extrinsics - given.extrinsics).max() < 0.1
+
+
+def test_images_without_a_camera_are_left_out(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As `idesplat infer` leaves out images that it cannot register, and writes the cameras of the others."""
+    shutil.copy("images/000.png", "images/unregistered.png")
+    assert run_command(main, *GIVEN, "-o", "out.ply", "--steps", "2", "--max-side", "64") == 0
+    printed = capsys.readouterr().out
+    assert "1 of 6 images have no camera; left out" in printed and "2 steps on 5 images" in printed
+
+
+def test_cameras_that_do_not_show_the_scene_are_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    away = read_splats(Path("scene.ply"))
+    write_ply(Path("scene.ply"), replace(away, means=away.means + np.float32(1000)))
+    assert run_command(main, *GIVEN, "-o", "out.ply", "--steps", "6", "--max-side", "64") == 2
+    assert "transforms.json: none of" in capsys.readouterr().err
+    assert not Path("out.ply").exists()
+
+
+def test_poses_that_their_file_cannot_hold_are_refused_first(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cameras = [
+        replace(camera, distortion=(0.1, 0, 0, 0, 0, 0.01, 0, 0)) for camera in read_cameras(Path("transforms.json"))
+    ]
+    write_cameras(Path("cameras.json"), cameras)
+    Path("transforms.json").unlink()
+    given = ("scene.ply", "-i", "images", "-c", "cameras.json", "-o", "out.ply", "--steps", "6", "--max-side", "64")
+    assert run_command(main, *given, "--refine-poses", "transforms.json") == 2
+    assert "a transforms.json can hold" in capsys.readouterr().err
+    assert not Path("out.ply").exists()
 
 
 @pytest.mark.parametrize(

@@ -65,6 +65,8 @@ def test_mistakes(clip, tmp_path):
             video.extract_sharp_frames(tmp_path / name, tmp_path)
     with pytest.raises(InputError, match=r"clip\.avi: the cameras do not name its frames, such as clip-000000\.png"):
         video.extract_named_frames(clip, ["a.png", "other-000003.png"], tmp_path)
+    with pytest.raises(InputError, match=r"clip\.avi: has none of the 2 frames that the cameras name, such as clip-0"):
+        video.extract_named_frames(clip, ["clip-000900.png", "clip-000901.png"], tmp_path)
     with pytest.raises(InputError, match="the cameras do not name its frames"):  # but images of another capture
         video.extract_named_frames(clip, ["0001.jpg", "0002.jpg", "0007.jpg"], tmp_path)
     with pytest.raises(InputError, match=r"damaged|expected two at least"):

@@ -170,6 +170,7 @@ def test_the_gradient_of_the_loss_matches_finite_differences(ssim_weight: float)
 
 def test_gradients_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     target, found = side_view(), []
+    monkeypatch.setattr("idesplat.runtime.refinement.rasterizer.BLOCK", 64)
     for threads in (1, 5):
         monkeypatch.setattr("idesplat.runtime.refinement.rasterizer.MOST_THREADS", threads)
         monkeypatch.setattr("os.cpu_count", lambda: 8)

@@ -73,6 +73,37 @@ def test_stops_when_told_to_and_leaves_its_input_alone(views: list[PosedImage], 
     np.testing.assert_array_equal(wrong_colours.means, means)
 
 
+def test_what_only_a_view_without_a_turn_shows_stays(views: list[PosedImage], wrong_colours: Gaussians) -> None:
+    """A wall hides all from the first view that has its turn; the other looks at the scene from past it."""
+    wall = Gaussians(
+        means=np.float32([[0, 0, 0.5], [0, 0, 0.52], [0, 0, 0.54]]),
+        scales=np.tile(np.float32([1, 1, 0.01]), (3, 1)),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (3, 1)),
+        opacities=np.full(3, 0.999, np.float32),
+        sh=np.zeros((3, *wrong_colours.sh.shape[1:]), np.float32),
+    )
+    behind = replace(views[0], viewmat=np.eye(4))
+    past = np.eye(4)
+    past[2, 3] = -1
+    before = replace(views[0], viewmat=past)
+    both = Gaussians.concatenate([wall, wrong_colours])
+    still = {f"lr_{name}": 0.0 for name in ("means", "scales", "quats", "opacities", "dc", "sh")}
+    options = RefinementOptions(steps=1, max_opacity=0.999, scale_factor=1, **still)
+    alone = len(refine(both, [behind], options).gaussians)
+    assert alone < 0.2 * len(both)
+    for seed in range(4):
+        kept = refine(both, [behind, before], replace(options, seed=seed)).gaussians
+        assert len(kept) > 0.6 * len(both)
+
+
+def test_views_that_do_not_show_the_scene_have_no_psnr(views: list[PosedImage], wrong_colours: Gaussians) -> None:
+    away = replace(views[0], viewmat=np.diag([-1.0, 1, -1, 1]))
+    refined = refine(wrong_colours, [away, *views], RefinementOptions(steps=4))
+    assert np.isnan(refined.psnr).sum() == 1
+    assert np.isfinite(refined.mean_psnr()).all()
+    assert np.isnan(refine(wrong_colours, [away], RefinementOptions(steps=2)).mean_psnr()).all()
+
+
 def test_pixels_without_weight_have_no_effect(views: list[PosedImage], wrong_colours: Gaussians) -> None:
     ignored = [PosedImage(view.image, view.viewmat, view.K, np.zeros_like(view.valid)) for view in views]
     refined = refine(wrong_colours, ignored, RefinementOptions(steps=6))
