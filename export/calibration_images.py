@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from ..runtime.cameras.io import read_cameras
+from ..runtime.errors import InputError
 from ..runtime.inference.metadata import INPUTS, ModelMetadata
 from ..runtime.inference.normalization import SceneNormalization
 from ..runtime.system.files import scratch_folder
@@ -25,12 +26,17 @@ def read_examples(images: Path, cameras: Path, metadata: ModelMetadata) -> list[
 
     images: a folder, a glob, a file or a video. cameras: a file or folder of any known format. Views and size are those
     of the graph, or of the training where they are dynamic.
-    Raises InputError for images or cameras that cannot be used.
+    Raises InputError for images or cameras that cannot be used, and for fewer images than a static graph takes.
     """
     count = metadata.fixed_views or metadata.trained_views[0]
     with scratch_folder() as folder:
         paths = find_input_images([images], cameras, None, folder)
         pairs = match_images_to_cameras(paths, read_cameras(cameras, paths))
+        if len(pairs) < metadata.fixed_views:
+            raise InputError(
+                f"--calibrate {images}: {len(pairs)} images with cameras, and the graph takes {metadata.fixed_views} "
+                "views; add images"
+            )
         matched = [camera for _, camera in pairs]
         partners = nearest_views(matched, guess_scene_depths(matched), count - 1)
         starts = np.unique(np.linspace(0, len(pairs) - 1, min(MAX_GROUPS, len(pairs))).round().astype(int))

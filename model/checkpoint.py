@@ -145,7 +145,7 @@ def _read_safetensors(path: Path) -> object:
 
 def _read_pickle(path: Path) -> object:
     """The content of a file of torch.save; only tensors and plain containers are unpickled."""
-    _check_archive(path)
+    check_archive(path)
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
@@ -159,8 +159,8 @@ def _read_pickle(path: Path) -> object:
         raise CheckpointError(f"{path}: not a readable checkpoint ({_reason(error)}); download it again") from None
 
 
-def _check_archive(path: Path) -> None:
-    """Refuse an archive whose entries claim more bytes than the file has: torch.save does not compress."""
+def check_archive(path: Path) -> None:
+    """Raise CheckpointError for an archive whose entries claim more bytes than it has: torch.save does not compress."""
     try:
         with zipfile.ZipFile(path) as archive:
             claimed = sum(entry.file_size for entry in archive.infolist())
@@ -177,11 +177,6 @@ def _reason(error: Exception) -> str:
     """The beginning of an exception's message."""
     lines = str(error).strip().splitlines()
     return _shown_text(lines[0]) if lines else type(error).__name__
-
-
-def fitting_presets(tensors: dict[str, Tensor]) -> list[str]:
-    """Names of the presets whose keys and shapes are exactly the file's."""
-    return [name for name, different in _differences_by_preset(tensors).items() if not different]
 
 
 def infer_preset(path: Path, tensors: dict[str, Tensor]) -> str:

@@ -44,6 +44,7 @@ LAZY = {
     "tools.benchmark.training": "PyTorch is optional",
     "tools.benchmark.worker": "measures what each import costs its process",
     "tools.evaluation.cases": "numba takes time to load, and is needed for synthetic scenes alone",
+    "tools.evaluation.chunks": "PyTorch is optional",
     "tools.evaluation.evaluate": "numba takes time to load, and is needed for synthetic scenes alone",
     "tools.evaluation.metrics": "PyTorch is optional, and needed for perceptual distances alone",
     "tools.synthetic.make_scene": "a command",

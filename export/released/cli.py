@@ -32,11 +32,10 @@ def pull(
     HF_ENDPOINT names a mirror of the hub. A download that was interrupted goes on where it ended.
     """
     from ...runtime.inference.known_models import KNOWN_MODELS
-    from ...runtime.inference.named_models import cached_path
     from ..pipeline import MismatchError
-    from .pull import is_current, pull_model
+    from .pull import is_cached, pull_model
 
-    before = name in KNOWN_MODELS and is_current(cached_path(name))
+    before = name in KNOWN_MODELS and is_cached(name, source, revision)
     try:
         path = pull_model(name, source, revision)
     except MismatchError as error:

@@ -13,7 +13,7 @@ from ..pipeline import export_checkpoint, require_pytorch
 def pull_model(name: str, source: Path | None = None, revision: str | None = None) -> Path:
     """The graph of a released model; downloaded, checked and exported unless this version has done it before.
 
-    source, revision: as for `download.fetch_checkpoint`.
+    source, revision: as for `download.fetch_checkpoint`; with either of them the model is exported again.
     Raises InputError for an unknown name, where PyTorch is missing, or the file cannot be had; MismatchError where the
     graph does not compute what the network does.
     """
@@ -21,7 +21,7 @@ def pull_model(name: str, source: Path | None = None, revision: str | None = Non
         return find_model(name)
     model = known_model(name)
     path = cached_path(name)
-    if is_current(path):
+    if is_cached(name, source, revision):
         return path
     require_pytorch()
     from .download import fetch_checkpoint
@@ -32,6 +32,12 @@ def pull_model(name: str, source: Path | None = None, revision: str | None = Non
     return path
 
 
-def is_current(path: Path) -> bool:
-    """Whether the cache has a graph that this version of idesplat exported."""
-    return path.is_file() and read_model(path).metadata.version == version("idesplat")
+def is_cached(name: str, source: Path | None = None, revision: str | None = None) -> bool:
+    """Whether the cache has a graph that this version exported, and no checkpoint of the caller's choice is wanted."""
+    path = cached_path(name)
+    return (
+        source is None
+        and revision is None
+        and path.is_file()
+        and read_model(path).metadata.version == version("idesplat")
+    )

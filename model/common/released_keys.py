@@ -92,8 +92,9 @@ UNET: list[Rule] = [
     (r"(residual|regulariser)\.1\.", r"\1.norm_in."),
     (r"(residual|regulariser)\.3\.", r"\1.unet."),
     (r"(residual|regulariser)\.4\.", r"\1.conv_out."),
-    (r"input_blocks\.(\d+)\.(\d)\.(?:op\.)?", _unet_input),
-    (r"output_blocks\.(\d+)\.(\d\.(?:conv\.)?)", _unet_output),
+    # Python converts no more than 4300 digits to a number.
+    (r"input_blocks\.(\d{1,4})\.(\d)\.(?:op\.)?", _unet_input),
+    (r"output_blocks\.(\d{1,4})\.(\d\.(?:conv\.)?)", _unet_output),
     (r"middle_block\.0\.", "middle.0."),
     (r"middle_block\.2\.", "middle.1."),
     (r"unet\.out\.0\.", "unet.norm_out."),

@@ -3,7 +3,6 @@
 import hashlib
 import os
 import re
-import shutil
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -23,6 +22,7 @@ FOLDER = "inputs"
 DEFAULT_GB = 10.0
 GB = 10**9
 DOWNLOADS = 8  # at a time
+REMOVED = "removed"
 ENTRY = re.compile(r"[0-9a-f]{32}-(\d+)")  # the hash of what it holds, and its bytes
 
 
@@ -71,6 +71,7 @@ class InputCache:
             folder.mkdir()
             _download(files, folder)
             (folder / LOCK_NAME).touch()
+            _move_if_broken(entry, scratch)
             with suppress(OSError):  # another process was faster
                 folder.rename(entry)
 
@@ -109,7 +110,7 @@ def _take(entry: Path) -> int | None:
     except FileNotFoundError:
         return None
     fcntl.flock(lock, fcntl.LOCK_SH)
-    if not (entry / LOCK_NAME).exists():  # it was removed meanwhile
+    if not _is_lock_of(lock, entry):  # it was removed meanwhile
         os.close(lock)
         return None
     os.utime(entry)
@@ -120,14 +121,33 @@ def _remove_if_unused(entry: Path) -> bool:
     try:
         lock = os.open(entry / LOCK_NAME, os.O_RDONLY | os.O_CLOEXEC)
     except FileNotFoundError:
-        shutil.rmtree(entry, ignore_errors=True)  # its removal was cut short
+        with scratch_folder(entry.parent) as scratch:
+            _move_if_broken(entry, scratch)
         return True
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        (entry / LOCK_NAME).unlink()
-        shutil.rmtree(entry, ignore_errors=True)
+        if not _is_lock_of(lock, entry):
+            return False
+        with scratch_folder(entry.parent) as scratch:  # it is gone at once, so that a new one may take its place
+            entry.rename(scratch / REMOVED)
         return True
     except BlockingIOError:
         return False
     finally:
         os.close(lock)
+
+
+def _is_lock_of(lock: int, entry: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(lock), os.stat(entry / LOCK_NAME))
+    except FileNotFoundError:
+        return False
+
+
+def _move_if_broken(entry: Path, scratch: Path) -> None:
+    """Move an entry without a lock, which an older version was killed while removing, into a folder that is removed."""
+    with suppress(OSError):
+        if not (entry / LOCK_NAME).exists():
+            entry.rename(scratch / REMOVED)
+            if (scratch / REMOVED / LOCK_NAME).exists():  # another process had just put a new one there
+                (scratch / REMOVED).rename(entry)

@@ -23,9 +23,14 @@ PLY = "ply"
 
 
 class Status(StrEnum):
-    """The state of a scene. STARTED: its process works on it, or was killed."""
+    """The state of a scene.
+
+    STARTED: its process reconstructs it, or was killed; older results are as they were. WRITING: its process replaces
+    the results, or was killed.
+    """
 
     STARTED = "started"
+    WRITING = "writing"
     DONE = "done"
     FAILED = "failed"
 

@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import math
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -17,10 +18,11 @@ from ..cameras.formats import ESTIMATE, CameraFormat
 from ..errors import InputError, error_context, raise_input_error
 from ..images.sizes import parse_size
 from ..inference.inputs import parse_views
-from ..reconstruction.quality import Quality
+from ..reconstruction.quality import Quality, parse_refine
 from ..splats.filtering import FilterOptions
 from ..system.files import open_regular, without_case
 from ..views.exposure_mode import ExposureMode
+from ..views.world_offset import AUTO, parse_offset
 from .places import Place, beside, join, open_store, parse_place, store_errors
 
 EXPECTED = "expected a folder of scene folders, or a .jsonl or .csv with a row for each scene"
@@ -144,11 +146,24 @@ def parse_shard(shard: str) -> tuple[int, int]:
 
 
 def check_options(options: Mapping[str, Any]) -> None:
-    """Raise InputError for options that are not in `OPTIONS`, or filters with invalid values."""
+    """Raise InputError for options that are not in `OPTIONS`, and for values that `reconstruct` would refuse.
+
+    None counts as absent.
+    """
     unknown = sorted(set(options) - set(OPTIONS))
     if unknown:
         raise InputError(f"unknown option {unknown[0]!r}; expected {', '.join(OPTIONS)}")
-    split_filters(options)
+    given = {name: value for name, value in options.items() if value is not None}
+    split_filters(given)
+    parse_offset(given.get("offset", AUTO))
+    parse_refine(given.get("refine", "0"))
+    if given.get("max_gaussians", 0) < 0:
+        raise InputError(f"max_gaussians {given['max_gaussians']}: expected a number of Gaussians, or 0 for all")
+    for name in ("near", "far"):
+        if name in given and not 0 < given[name] < math.inf:
+            raise InputError(f"{name} {given[name]:g}: expected a positive depth in scene units")
+    if given.get("near", 0) >= given.get("far", math.inf):
+        raise InputError(f"near {given['near']:g} and far {given['far']:g}: expected near < far")
 
 
 def _read(place: Place) -> Iterator[Scene]:
@@ -225,6 +240,7 @@ def make_scene(row: Mapping[Any, Any], table: Place) -> Scene:
         if name in given:
             with error_context(f"{name} {given[name]!r}"):
                 options[name] = parse_option(name, given[name])
+    check_options(options)
     cameras = given.get("cameras")
     place = beside(table, cameras) if cameras and cameras != ESTIMATE else cameras
     return Scene(_checked_id(given["id"]), beside(table, given["images"]), place, options)
@@ -242,7 +258,7 @@ def parse_option(name: str, text: str) -> Any:
 
 def split_filters(options: Mapping[str, Any]) -> tuple[FilterOptions, dict[str, Any]]:
     """The filters among options, and the other options; raises InputError for filters that cannot be."""
-    filters = FilterOptions(**{name: value for name, value in options.items() if name in FILTERS})
+    filters = FilterOptions(**{name: value for name, value in options.items() if name in FILTERS and value is not None})
     return filters, {name: value for name, value in options.items() if name not in FILTERS}
 
 

@@ -18,6 +18,7 @@ from ..inference.predictor import Predictor
 from ..inference.providers import candidates
 from ..inference.session import SessionConfig
 from ..reconstruction.pipeline import reconstruct
+from ..reconstruction.result import Reconstruction
 from ..system.memory import peak_bytes, reset_peak
 from ..system.outputs import outputs
 from ..system.threads import limit_threads
@@ -126,15 +127,16 @@ def start_worker(settings: Settings, threads: int) -> "Worker":
 def record_killed(scene: Scene, settings: Settings) -> Outcome:
     """The failure of a scene whose worker was killed twice; written down where the disk or the store takes it.
 
-    What the worker had written by then is removed; older results stay, if it had not begun to replace them.
+    What the worker had written by then is removed; older results stay, if it had not begun to replace them, and the
+    record names their files.
     """
     place = join(settings.out, scene.id)
-    record = {"id": scene.id, "status": Status.FAILED, "error": KILLED, "hash": None, "seconds": None}
+    record: dict[str, Any] = {"id": scene.id, "status": Status.FAILED, "error": KILLED, "hash": None, "seconds": None}
     try:
         results = open_results(place)
         before = read_record(results) or {}
-        record["hash"] = before.get("hash")
-        _remove_started(results, before, settings)
+        record |= {"hash": before.get("hash"), "files": files_of(before)}
+        _remove_partial(results, before, settings)
         if isinstance(place, Path):
             outputs().writes("", [place / RECORD], known=True)
         write_record(results, record)
@@ -143,9 +145,9 @@ def record_killed(scene: Scene, settings: Settings) -> Outcome:
     return Outcome(record, True)
 
 
-def _remove_started(results: Results, record: Mapping[str, Any], settings: Settings) -> None:
-    """Remove what was written of a scene whose record says that it was started and no more."""
-    if record.get("status") == Status.STARTED:
+def _remove_partial(results: Results, record: Mapping[str, Any], settings: Settings) -> None:
+    """Remove what was written of a scene whose record says that its results are being replaced."""
+    if record.get("status") == Status.WRITING:
         for name in (splats_name(settings.splat_format), PICTURE):
             results.remove(name)
 
@@ -171,6 +173,7 @@ class Worker:
             results = open_results(join(self.settings.out, scene.id))
             results.tidy()
             before = read_record(results) or {}
+            _remove_partial(results, before, self.settings)
             inputs = open_inputs(scene, InputCache(self.settings.cache_bytes))
             made_from = self._fingerprint(scene, inputs.hashes())
             if is_done(results, before, made_from) or self._stays_failed(before, made_from):
@@ -183,18 +186,22 @@ class Worker:
             return Outcome(self._fail(scene, made_from, error, started), True)
         predictor = self._open()
         try:
-            # No record of other splats may stand beside new ones, and a killed worker leaves what it worked on.
-            write_record(results, {"id": scene.id, "hash": made_from, "status": Status.STARTED})
-            for name in {*files_of(before), splats_name(self.settings.splat_format)}:
-                results.remove(name)
+            about, older = {"id": scene.id, "hash": made_from}, files_of(before)
+            # A killed worker leaves what it worked on. Older results stay until there is something to replace them.
+            write_record(results, {**about, "status": Status.STARTED, "files": older})
             with inputs.local() as local:
-                record = self._reconstruct(local, results, predictor)
+                result = self._reconstruct(local, predictor)
+            # No record of other splats may stand beside new ones.
+            write_record(results, {**about, "status": Status.WRITING})
+            for name in {*older, splats_name(self.settings.splat_format)}:
+                results.remove(name)
+            record = about | self._write(result, results)
             results.remove(TRACEBACK)
-            record |= {"hash": made_from, "seconds": time.perf_counter() - started, "peak_memory": peak_bytes()}
+            record |= {"seconds": time.perf_counter() - started, "peak_memory": peak_bytes()}
             write_record(results, record)
         except Exception as error:  # one scene's failure must not end the others
             with suppress(InputError, OSError):
-                _remove_started(results, read_record(results) or {}, self.settings)
+                _remove_partial(results, read_record(results) or {}, self.settings)
             record = self._fail(scene, made_from, error, started)
         return Outcome(record, True)
 
@@ -213,10 +220,12 @@ class Worker:
             self._predictor = Predictor(self.settings.model, self.settings.provider, self.settings.session)
         return self._predictor
 
-    def _reconstruct(self, scene: Scene, results: Results, predictor: Predictor) -> dict[str, Any]:
-        """Write the splats and the picture; the record of them."""
+    def _reconstruct(self, scene: Scene, predictor: Predictor) -> Reconstruction:
         filters, options = split_filters({**self.settings.options, **scene.options})
-        result = reconstruct(scene.images, scene.cameras, model=predictor, filters=filters, **options)
+        return reconstruct(scene.images, scene.cameras, model=predictor, filters=filters, **options)
+
+    def _write(self, result: Reconstruction, results: Results) -> dict[str, Any]:
+        """Write the splats and the picture; what the record says of them."""
         finished = time.perf_counter()
         splats = splats_name(self.settings.splat_format)
         with results.writing(splats) as temporary:
@@ -227,7 +236,6 @@ class Worker:
             save_picture(temporary, picture)
         measured = time.perf_counter()
         return {
-            "id": scene.id,
             "status": Status.DONE,
             "version": version("idesplat"),
             "files": {name: results.describe(name) for name in (splats, PICTURE)},
@@ -243,11 +251,18 @@ class Worker:
         line = one_line(error)
         line = line if isinstance(error, InputError) else f"{type(error).__name__}: {line}"
         seconds = time.perf_counter() - started
-        record = {"id": scene.id, "status": Status.FAILED, "error": line, "hash": made_from, "seconds": seconds}
+        record: dict[str, Any] = {
+            "id": scene.id,
+            "status": Status.FAILED,
+            "error": line,
+            "hash": made_from,
+            "seconds": seconds,
+        }
         with suppress(InputError, OSError):
             results = open_results(join(self.settings.out, scene.id))
             if not self.settings.overwrite:
                 check_own(results, scene.id, splats_name(self.settings.splat_format))
+            record["files"] = files_of(read_record(results) or {})  # older results, which stay
             write_text(results, TRACEBACK, "".join(traceback.format_exception(error)))
             write_record(results, record)
         return record

@@ -139,6 +139,7 @@ def batch(
     from ..batch.places import join, parse_place
     from ..batch.run import batch as run_batch
     from ..batch.run import index_name, summary_name
+    from ..batch.scenes import FILTERS
     from ..images.sizes import parse_size
     from ..inference.inputs import parse_views
     from ..system.outputs import outputs
@@ -166,6 +167,7 @@ def batch(
         "merge_duplicates": merge_duplicates,
         "close_holes": close_holes,
     }
+    unset = {*FILTERS, "crop", "max_gaussians"}  # options that 0 or false leave off
     on_terminal = sys.stdout.isatty()  # asked before there is progress, which takes the stream
     target = parse_place(out)
     summary_place, page = join(target, summary_name(shard)), join(target, index_name(shard))
@@ -179,7 +181,7 @@ def batch(
         address=address,
         model=model,
         splat_format=splat_format,
-        options={name: value for name, value in options.items() if value},
+        options={name: value for name, value in options.items() if value is not None and (value or name not in unset)},
         workers=workers,
         provider=provider,
         session=session,

@@ -40,12 +40,6 @@ class KnownModel:
         named = NAMED_HASH.search(self.file)
         return named[1] if named else ""
 
-    @property
-    def views_text(self) -> str:
-        """The numbers of views in training, such as `2` or `2 to 6`."""
-        least, most = self.views
-        return str(least) if least == most else f"{least} to {most}"
-
 
 def _depthsplat(preset: str, parameters: float, size: tuple[int, int], views: tuple[int, int], file: str) -> KnownModel:
     gaussians = file.startswith("depthsplat-gs-")

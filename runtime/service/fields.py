@@ -5,13 +5,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..batch.scenes import OPTIONS, parse_option, split_filters
+from ..batch.scenes import OPTIONS, check_options, parse_option
 from ..cameras.formats import CameraFormat
 from ..errors import InputError, error_context
 from ..inference.inputs import ALL, select_images
-from ..reconstruction.quality import PRESETS, Quality, parse_refine
+from ..reconstruction.quality import PRESETS, Quality
 from ..views.exposure_mode import ExposureMode
-from ..views.world_offset import parse_offset
 from .limits import Limits, Refused
 
 MAX_TEXT = 2000  # characters of a field
@@ -80,7 +79,7 @@ def parse_options(texts: Mapping[str, str], default: Quality, images: Sequence[P
             raise InputError(f"{name}: {len(text)} characters, expected {MAX_TEXT} at most")
         if text:
             options[name] = _parse_field(name, text)
-    _check_values(options)
+    check_options(options)  # before anything is queued
     _check_limits(options, default, images, limits)
     return options
 
@@ -91,18 +90,6 @@ def _parse_field(name: str, text: str) -> Any:
         if isinstance(value, float) and not math.isfinite(value):
             raise InputError("expected a finite number")
         return value
-
-
-def _check_values(options: Mapping[str, Any]) -> None:
-    """Raise InputError for what a reconstruction would refuse, before anything is queued."""
-    split_filters(options)
-    parse_offset(options.get("offset", "auto"))
-    parse_refine(options.get("refine", "0"))
-    if options.get("max_gaussians", 0) < 0:
-        raise InputError(f"max_gaussians {options['max_gaussians']}: expected 0 or more")
-    near, far = options.get("near", 0.0), options.get("far", math.inf)
-    if ("near" in options and near <= 0) or far <= near:
-        raise InputError(f"near {near:g} and far {far:g}: expected positive depths, near < far")
 
 
 def _check_limits(options: Mapping[str, Any], default: Quality, images: Sequence[Path], limits: Limits) -> None:

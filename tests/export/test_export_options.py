@@ -18,6 +18,7 @@ from idesplat.export.example_inputs import example_inputs
 from idesplat.export.targets import GraphSettings
 from idesplat.model.depthsplat.network import DepthSplat
 from idesplat.model.registry import PRESETS, build
+from idesplat.runtime.errors import InputError
 from idesplat.runtime.inference.metadata import INPUTS, ModelMetadata
 from tiny_model import OWN
 
@@ -143,6 +144,12 @@ def test_calibration_inputs_are_what_inference_would_prepare(scene: Path) -> Non
         assert feeds["images"].shape == (2, 3, 64, 96)
         assert feeds["near"] == pytest.approx(0.5)
         np.testing.assert_allclose(feeds["extrinsics"][:, :3, 3].mean(0), 0, atol=1e-5)
+
+
+def test_too_few_calibration_images_for_a_static_graph_are_refused(scene: Path) -> None:
+    metadata = ModelMetadata(**{**vars(OWN), "fixed_views": 6})
+    with pytest.raises(InputError, match=r"--calibrate .*: 5 images with cameras, and the graph takes 6 views; add"):
+        read_examples(scene / "images", scene / "transforms.json", metadata)
 
 
 def test_ranges_are_found_on_the_images(hub, checkpoint, kept_traces, scene, tmp_path) -> None:

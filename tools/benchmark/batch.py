@@ -17,6 +17,7 @@ import typer
 from ...runtime.batch.run import Engine, batch
 from ...runtime.cli.outputs import command
 from ...runtime.cli.terminal import run, say
+from ...runtime.errors import InputError
 from ...runtime.inference.session import SessionConfig
 from ..synthetic.make_scene import make_scene
 
@@ -35,6 +36,9 @@ def measure(
     workers: Annotated[int, typer.Option(help="Each takes one thread.", min=1)] = 2,
 ) -> None:
     """Reconstruct synthetic scenes and print what the batch costs beyond the model's own time."""
+    out = folder / f"{engine}-{workers}-{scenes}"
+    if out.exists():
+        raise InputError(f"{out}: results are there already, and what is done is not measured; choose a new folder")
     table = write_scenes(folder, scenes)
     records: list[dict[str, Any]] = []
     ended: list[float] = []
@@ -46,7 +50,7 @@ def measure(
     started = time.perf_counter()
     batch(
         table,
-        folder / f"{engine}-{workers}-{scenes}",
+        out,
         engine=engine,
         workers=workers,
         options={"quality": "fast", "views": VIEWS},

@@ -20,6 +20,7 @@ import typer
 
 from ...runtime.cli.outputs import command
 from ...runtime.cli.terminal import run, say
+from ...runtime.errors import InputError
 from ..processes import descendants
 
 VICTIMS = ("driver", "actor", "raylet")
@@ -46,11 +47,17 @@ def kills(
 def check_kills(
     scenes: Path, out: Path, moments: int, seed: int, model: Path | None = None, tell: Callable[[str], object] = str
 ) -> None:
-    """Raise AssertionError unless a batch that was killed at random moments gives what an undisturbed one gives."""
+    """Raise AssertionError unless a batch that was killed at random moments gives what an undisturbed one gives.
+
+    Raises InputError if the undisturbed one fails.
+    """
     arguments = ["batch", str(scenes), "--quality", "fast", "--workers", "2", "--threads", "1"]
     arguments += ["--model", str(model)] * (model is not None)
-    _start(arguments, out / "undisturbed").wait(LONGEST)
+    status = _start(arguments, out / "undisturbed").wait(LONGEST)
+    if status:
+        raise InputError(f"{scenes}: without kills the batch ends with status {status}; give scenes that all succeed")
     expected = results(out / "undisturbed")
+    assert expected, "the undisturbed run has no results"
     rng, done, runs = random.Random(seed), 0, 0
     while done < moments:
         runs += 1

@@ -28,7 +28,7 @@ from ...runtime.cli.options import (
 from ...runtime.cli.outputs import STANDARD_OUTPUT, command
 from ...runtime.cli.session_options import session_config
 from ...runtime.cli.terminal import literal, run, say, warn
-from ...runtime.errors import InputError
+from ...runtime.errors import InputError, error_context
 from ...runtime.images.sizes import parse_size
 from ...runtime.system.limits import parse_whole_number
 from ...runtime.system.outputs import outputs
@@ -87,6 +87,7 @@ def bench(
         print_providers()
         return
     if training:
+        _check_unused({"MODELS": models, "--sizes": sizes, "--json": json_path, "--compare": compare})
         from .training import benchmark_training, print_training
 
         with _status() as status:
@@ -124,19 +125,22 @@ def bench(
     for row in rows:
         if row.problem:
             warn(f"{row.name}: {row.problem}")
-    rows = [row for row in rows if row.seconds]
-    if rows:
-        print_rows(rows)
-    if rows and json_path is not None:
-        write_rows(json_path, describe_machine(settings), rows)
+    measured = [row for row in rows if row.seconds]
+    if measured:
+        print_rows(measured)
+    if measured and json_path is not None:
+        write_rows(json_path, describe_machine(settings), measured)
         if json_path != STANDARD_OUTPUT:
             say(f"wrote {json_path}")
     if interrupted:
         warn("interrupted: unfinished workloads are missing")
         raise SystemExit(INTERRUPTED)
-    if not rows:
+    if not measured:
         raise InputError("nothing could be measured, for the reasons above")
-    regressions = compare_rows(rows, before) if compare is not None else []
+    regressions: list[str] = []
+    if compare is not None:
+        with error_context(f"--compare {compare}"):
+            regressions = compare_rows(rows, before)
     for line in regressions:
         warn(f"regression: {line}")
     if regressions:
@@ -146,6 +150,15 @@ def bench(
 def main() -> None:
     """Run the command."""
     run(bench)
+
+
+def _check_unused(given: dict[str, object]) -> None:
+    """Raise InputError for the first argument that has a value, which a benchmark of training does not use."""
+    for name, value in given.items():
+        if value:
+            raise InputError(
+                f"--training and {name}: expected one of them; training is measured on networks of its own"
+            )
 
 
 def _check_json(json_path: Path | None, read: Sequence[Path]) -> None:

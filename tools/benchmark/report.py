@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ...runtime.cli.outputs import write_json
-from ...runtime.cli.terminal import literal
+from ...runtime.cli.terminal import literal, warn
 from ...runtime.errors import InputError
 from ...runtime.inference.providers import (
     CPU,
@@ -30,6 +30,7 @@ WIDTH = 150  # columns, if the output is not a terminal
 SHOWN = 7  # operators of a row
 # Medians within this factor are not a regression, whatever the spread.
 TOLERANCE = 1.05
+LOST = "can no longer be measured"
 
 
 @dataclass
@@ -131,9 +132,18 @@ def compare(rows: Sequence[Row], before: Sequence[Row]) -> list[str]:
     """Print the changes since an earlier benchmark; returns a line for each regression.
 
     Times are relative to the GEMM reference of the same rounds. A row is slower if its median is more than 5 % higher
-    and its first quartile is above the earlier third quartile. Memory regresses by more than 5 %.
+    and its first quartile is above the earlier third quartile. Memory regresses by more than 5 %. A row that was
+    measured and now has a problem instead is a regression. Warns of rows of one benchmark alone, and raises InputError
+    if no row is in both.
     """
     known = {row.key: row for row in before if row.seconds}
+    now = {row.key: row for row in rows}
+    if not known.keys() & now.keys():
+        raise InputError("none of its rows is measured here; give the same models, --views, --sizes and --provider")
+    for row in (row for key, row in now.items() if key not in known):
+        warn(f"{row.name}: not in the earlier benchmark, so not compared")
+    for row in (row for key, row in known.items() if key not in now):
+        warn(f"{row.name}: in the earlier benchmark alone, so not compared")
     table = Table(title="changes", title_justify="left")
     table.add_column("model")
     for name in ("time", "memory"):
@@ -142,12 +152,12 @@ def compare(rows: Sequence[Row], before: Sequence[Row]) -> list[str]:
     worse = []
     for row in rows:
         old = known.get(row.key)
-        if old is None or not row.seconds:
+        if old is None:
             continue
-        verdicts = _verdicts(row, old)
-        time = float(np.median(row.effort) / np.median(old.effort))
+        verdicts = _verdicts(row, old) if row.seconds else [LOST]
+        time = f"{np.median(row.effort) / np.median(old.effort):.2f}" if row.seconds else ""
         memory = f"{row.peak_bytes / old.peak_bytes:.2f}" if row.peak_bytes and old.peak_bytes else ""
-        table.add_row(literal(row.name), f"{time:.2f}", memory, ", ".join(verdicts))
+        table.add_row(literal(row.name), time, memory, ", ".join(verdicts))
         worse += [f"{row.name}: {verdict}" for verdict in verdicts]
     print_table(table)
     return worse

@@ -33,6 +33,8 @@ CAMERA_NUMBERS = 18
 FIRST_POSE_NUMBER = 6
 # Times near: the near plane of the releases' renderer.
 NEAR_PLANE_FACTOR = 0.2
+FLOATS = (np.float32, np.float64)
+PLAIN = "dense tensor in memory without gradient, of a type that NumPy has"
 INSTALL = "pip install 'idesplat[eval]'"
 
 
@@ -87,7 +89,13 @@ def read_chunk(path: Path) -> list[dict[str, Any]]:
         raise InputError(f"{path}: PyTorch is needed to read chunks, and is not installed; {INSTALL}")
     import torch
 
+    from ...model.checkpoint import CheckpointError, check_archive
+
     check_regular(path)
+    try:
+        check_archive(path)
+    except CheckpointError as error:
+        raise InputError(str(error)) from None
     try:
         with warnings.catch_warnings(action="ignore"):  # torch warns before it raises
             scenes = torch.load(path, map_location="cpu", weights_only=True)
@@ -145,20 +153,34 @@ def _are_frames(value: object) -> bool:
 
 def _check_scene(scene: dict[str, Any], where: str) -> None:
     """Raise InputError unless a scene has its fields, each of the right type and shape."""
-    import torch
-
-    key, cameras, images = scene.get("key"), scene.get("cameras"), scene.get("images")
+    key, images = scene.get("key"), scene.get("images")
     if not isinstance(key, str) or Path(key).name != key:
         raise InputError(f"{where}: key is {key!r:.60}, expected the scene's name")
-    if not isinstance(cameras, torch.Tensor) or cameras.ndim != 2 or cameras.shape[1] != CAMERA_NUMBERS:
-        shape = list(cameras.shape) if isinstance(cameras, torch.Tensor) else type(cameras).__name__
-        raise InputError(f"{where} ({key}): cameras is {shape}, expected a tensor [frames, {CAMERA_NUMBERS}]")
+    cameras = _array(scene.get("cameras"))
+    if cameras is None or cameras.dtype not in FLOATS or cameras.ndim != 2 or cameras.shape[1] != CAMERA_NUMBERS:
+        found = f"no {PLAIN}" if cameras is None else f"{cameras.dtype} {list(cameras.shape)}"
+        raise InputError(f"{where} ({key}): cameras is {found}, expected float32 or float64 [frames, {CAMERA_NUMBERS}]")
     if not isinstance(images, list) or len(images) != len(cameras):
         count = len(images) if isinstance(images, list) else type(images).__name__
         raise InputError(f"{where} ({key}): images is {count}, expected one for each of {len(cameras)} cameras")
-    for number, image in enumerate(images):
-        if not isinstance(image, torch.Tensor) or image.dtype != torch.uint8 or image.ndim != 1:
-            raise InputError(f"{where} ({key}): images[{number}] is no uint8 tensor [bytes] of a JPEG file")
+    for number, image in enumerate(map(_array, images)):
+        # Of others, such as a byte that is said to repeat, a file of any size may hold more than fits into memory.
+        if image is None or image.dtype != np.uint8 or image.ndim != 1 or not image.flags.c_contiguous:
+            raise InputError(
+                f"{where} ({key}): images[{number}] is no dense, contiguous uint8 tensor [bytes] of a JPEG file"
+            )
+
+
+def _array(value: object) -> np.ndarray | None:
+    """The values of a tensor; None for anything else, and for a tensor that is not `PLAIN`."""
+    import torch
+
+    if not isinstance(value, torch.Tensor):
+        return None
+    try:
+        return torch.Tensor.numpy(value)
+    except (TypeError, RuntimeError):
+        return None
 
 
 def _posed(scene: dict[str, Any], frames: list[int], height: int, width: int) -> PosedImages:

@@ -1,6 +1,8 @@
 """Evaluation cases from a folder of images with cameras: held-out images, and context views around each."""
 
+import hashlib
 import math
+import os
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -30,6 +32,9 @@ MARGIN = 2
 DEPTH = "depth"  # in an .npz of true depth
 NPY_HEADER_BYTES, MAX_BYTES_PER_DEPTH = 1 << 16, 16
 MIN_VALID = 0.1  # of a image's pixels
+MAX_NAME_BYTES = 100  # of a case's name, to which strips add a target's; file names have 255 at most
+MAX_STEM_BYTES = 36
+HASH_DIGITS = 8
 
 
 def split_frames(
@@ -39,7 +44,7 @@ def split_frames(
 
     context, targets: file names, with suffix or without. Without targets, one of every `hold_out_every` frames is held
     out, from the first one; without a context, each target gets the `views` frames around it that are not held out.
-    Raises InputError for names of no frame or of several, for names given twice, and for too few frames.
+    Raises InputError for names of no frame or of several, for names given twice, and for too few frames or views.
     """
     given = [_number(frames, name, "--context") for name in context]
     held_out = [_number(frames, name, "--hold-out") for name in targets]
@@ -52,6 +57,8 @@ def split_frames(
         if len(given) < 2:
             raise InputError(f"--context names {len(given)} frame, expected at least 2")
         return [(given, held_out)]
+    if views < 2:
+        raise InputError(f"--views {views}: expected at least 2 images around each target")
     held_out = held_out or list(range(0, len(frames), hold_out_every))
     rest = [number for number in range(len(frames)) if number not in held_out]
     if len(rest) < views:
@@ -113,8 +120,27 @@ def load_case(
     given, held_out = taken(slice(count)), taken(slice(count, None))
     found = find_range(given)
     truth = None if depth is None else np.stack([_fitted_depth(depth, *frame, *size) for frame in chosen[:count]])
-    name = "+".join(path.stem for path, _ in chosen[:count])
-    return EvalCase(name, posed(given, valid[:count]), posed(held_out, valid[count:]), found.near, found.far, truth)
+    return EvalCase(
+        _case_name([path.stem for path, _ in chosen[:count]]),
+        posed(given, valid[:count]),
+        posed(held_out, valid[count:]),
+        found.near,
+        found.far,
+        truth,
+    )
+
+
+def _case_name(stems: Sequence[str]) -> str:
+    """The stems of the context's images with + between; of many or long ones the first, the last, a count and a hash.
+
+    Files are named after it.
+    """
+    name = "+".join(stems)
+    encoded = os.fsencode(name)
+    if len(encoded) <= MAX_NAME_BYTES:
+        return name
+    first, last = (os.fsencode(stem)[:MAX_STEM_BYTES].decode(errors="ignore") for stem in (stems[0], stems[-1]))
+    return f"{first}+{last}-{len(stems)}-{hashlib.sha256(encoded).hexdigest()[:HASH_DIGITS]}"
 
 
 def _number(frames: Sequence[Frame], name: str, option: str) -> int:

@@ -149,14 +149,15 @@ def render_target(gaussians: Gaussians, targets: PosedImages, view: int, near_pl
 
 
 def _mean(entries: list[Scores]) -> Scores:
-    """The mean of entries with the same methods; of each metric over those that have it."""
-    return {
-        method: {
-            measure: float(np.mean([entry[method][measure] for entry in entries if measure in entry[method]]))
-            for measure in dict.fromkeys(measure for entry in entries for measure in entry[method])
+    """The mean of entries; of each method and metric over those that have it."""
+    means: Scores = {}
+    for method in dict.fromkeys(method for entry in entries for method in entry):
+        found = [entry[method] for entry in entries if method in entry]
+        means[method] = {
+            measure: float(np.mean([scores[measure] for scores in found if measure in scores]))
+            for measure in dict.fromkeys(measure for scores in found for measure in scores)
         }
-        for method in entries[0]
-    }
+    return means
 
 
 def comparison_strip(

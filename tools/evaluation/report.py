@@ -36,9 +36,11 @@ WIDTH = 130  # columns, where the output is no terminal
 
 
 def print_views(results: Sequence[Result]) -> None:
-    """Print a row for each target view, with every method's metrics."""
-    scores = results[0].targets[0].scores
-    columns = [(metric, method) for metric in scores[MODEL] for method in scores]
+    """Print a row for each target view, with every method's metrics; those that a view lacks are empty."""
+    scores = [target.scores for result in results for target in result.targets]
+    methods = dict.fromkeys(method for view in scores for method in view)
+    metrics = dict.fromkeys(metric for view in scores for metric in view[MODEL])
+    columns = [(metric, method) for metric in metrics for method in methods]
     table = Table()
     table.add_column("target", no_wrap=True)
     table.add_column("from")
@@ -47,7 +49,8 @@ def print_views(results: Sequence[Result]) -> None:
         table.add_column(f"{heading}\n{METHODS[method]}", justify="right", no_wrap=True)
     for result in results:
         for target in result.targets:
-            cells = [_number(metric, target.scores[method][metric]) for metric, method in columns]
+            found = [(metric, target.scores.get(method, {}).get(metric)) for metric, method in columns]
+            cells = ["" if value is None else _number(metric, value) for metric, value in found]
             table.add_row(literal(target.name), literal(", ".join(result.context)), *cells)
     print_table(table)
 

@@ -31,9 +31,9 @@ JPEG_QUALITY = 90
 def figures(
     names: Annotated[list[str], typer.Argument(help="Captures.", show_default=False)],
     checkouts: Annotated[Path, typer.Option(help="Folder of checkouts; missing ones are cloned into it.")],
-    out: Annotated[Path, typer.Option(help="Folder for NAME.jpg.")],
+    out: Annotated[Path, typer.Option(help="Folder for capture-NAME.jpg.")],
 ) -> None:
-    """Write NAME.jpg: prediction and finished scene at a held-out camera, and both from the side."""
+    """Write capture-NAME.jpg: prediction and finished scene at a held-out camera, and both from the side."""
     for capture in read_captures(names):
         path = make_folder(out) / f"capture-{capture.name}.jpg"
         with frames_of(checkouts, capture) as folder:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
+from ...runtime.cli.terminal import run
 from ...runtime.geometry.sh import sh_basis
 from ...runtime.system.files import atomic_write
 
@@ -155,7 +156,7 @@ def conventions(folder: Annotated[Path, typer.Argument(help="Folder for the figu
 
 def main() -> None:
     """Run the command."""
-    typer.run(conventions)
+    run(conventions)
 
 
 def _panels(rows: int, columns: int, size: tuple[float, float]) -> "tuple[Figure, list[Axes]]":

@@ -88,6 +88,10 @@ def test_a_model_is_pulled_by_name_and_runs(hub: Hub, nano, kept_traces, tmp_pat
     assert run_command(cli.main, NAME) == 0
     assert f"is in the cache already: {graph}\n" in capsys.readouterr().out
     assert len(hub.requests) == before
+    assert run_command(cli.main, NAME, "--revision", "no-such-branch") == 2
+    assert f"cannot be downloaded from {hub.url}/{DEPTHSPLAT} at no-such-branch" in capsys.readouterr().err
+    assert run_command(cli.main, NAME, "--from", tmp_path) == 2
+    assert f"no such file; give the folder that has {nano.file}" in capsys.readouterr().err
 
     assert run_command(models.main, "--json", "-") == 0
     listed = {row["name"]: row for row in json.loads(capsys.readouterr().out)}

@@ -3,7 +3,9 @@
 import json
 
 import pytest
-from idesplat.runtime.batch.scenes import read_scenes
+from conftest import run_command
+from idesplat.runtime.batch.scenes import check_options, read_scenes
+from idesplat.runtime.cli import batch
 from idesplat.runtime.errors import InputError
 
 
@@ -20,6 +22,7 @@ from idesplat.runtime.errors import InputError
         ({"id": "a", "images": "\0"}, "no file can have this name"),
         ({"id": "a", "images": "x", "sise": 3}, "unknown column 'sise'"),
         ({"id": "a", "images": "x", "near": "close"}, "near 'close': expected a number"),
+        ({"id": "a", "images": "x", "near": 0}, "scene 1: near 0: expected a positive depth"),
         ({"id": "a", "images": "x", "crop": 3}, "expected true or false"),
         ({"id": "a", "images": "x", "quality": "best"}, "expected one of fast, standard, high"),
         ([1], "expected an object"),
@@ -73,3 +76,17 @@ def test_shards_share_the_scenes_out(tmp_path):
     for wrong in ("0/3", "4/3", "1", "1/", "a/b", "1/0", "-1/2", "²/3"):
         with pytest.raises(InputError, match="--shard"):
             scenes.of_shard(wrong)
+
+
+def test_options_that_are_none_count_as_absent():
+    check_options(
+        {"near": None, "far": 2.0, "offset": None, "refine": None, "max_gaussians": None, "min_opacity": None}
+    )
+
+
+def test_the_command_refuses_a_near_of_zero(tmp_path, capsys):
+    (tmp_path / "scenes" / "a").mkdir(parents=True)
+    arguments = (tmp_path / "scenes", "--out", tmp_path / "out", "--near", "0", "--max-gaussians", "0")
+    assert run_command(batch.main, *arguments) == 2
+    assert "near 0: expected a positive depth" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -16,6 +16,7 @@ from idesplat.runtime.batch.places import beside, parse_place
 from idesplat.runtime.batch.results import open_results
 from idesplat.runtime.batch.scenes import Scene, read_scenes
 from idesplat.runtime.errors import InputError
+from idesplat.runtime.system.files import LOCK_NAME
 from scene_files import snapshot
 from tiny_model import write_model
 
@@ -112,10 +113,38 @@ def test_the_cache_is_bounded_and_keeps_what_is_in_use(bucket, cache):
             assert Path(same.images, "images").stat().st_ino == inode  # not downloaded again
     with second.local():
         assert len(os.listdir(cache)) == 2  # b was there: no room was needed
-    os.utime(next(cache.iterdir()))
     third = StoredInputs(Scene("t", f"{BUCKET}/scenes/a/images"), InputCache(1))
     with third.local():
         assert len(os.listdir(cache)) == 1
+
+
+@pytest.mark.parametrize("used", "ab")
+def test_what_was_not_used_for_the_longest_time_goes_first(bucket, cache, used):
+    entries = {}
+    for name in ("a", "b", "a/images"):
+        with StoredInputs(Scene("x", f"{BUCKET}/scenes/{name}"), InputCache(1 << 30)).local():
+            (new,) = set(cache.iterdir()) - set(entries.values())
+            entries[name] = new
+    third = entries.pop("a/images")
+    shutil.rmtree(third)
+    for entry in entries.values():
+        os.utime(entry, (0, 0))
+    with StoredInputs(Scene("x", f"{BUCKET}/scenes/{used}"), InputCache(1 << 30)).local():
+        pass
+    room = sum(int(entry.name.partition("-")[2]) for entry in (entries[used], third))
+    with StoredInputs(Scene("x", f"{BUCKET}/scenes/a/images"), InputCache(room)).local():
+        assert set(cache.iterdir()) == {entries[used], third}
+
+
+def test_an_entry_whose_removal_was_cut_short_is_downloaded_again(bucket, cache):
+    inputs = StoredInputs(Scene("a", f"{BUCKET}/scenes/a"), InputCache(1 << 30))
+    with inputs.local():
+        (entry,) = cache.iterdir()
+    (entry / LOCK_NAME).unlink()
+    next(entry.rglob("000.png")).unlink()
+    with inputs.local() as local:
+        assert len(list(Path(local.images, "images").iterdir())) == 2
+        assert os.listdir(cache) == [entry.name]
 
 
 def test_a_record_is_read_from_a_store_that_lost_it_as_none(bucket):

@@ -17,6 +17,17 @@ from idesplat.runtime.inference.model_files import read_model
 from idesplat.runtime.inference.session import DEFAULT
 from tiny_model import NETWORK, write_model
 
+WRONG = (
+    ({"nears": 1}, "unknown option 'nears'"),
+    ({"near": 0.0}, "near 0: expected a positive depth"),
+    ({"far": float("nan")}, "far nan: expected a positive depth"),
+    ({"near": 3.0, "far": 2.0}, "near 3 and far 2: expected near < far"),
+    ({"refine": "soon"}, "--refine soon"),
+    ({"offset": "1,2"}, "--offset 1,2"),
+    ({"max_gaussians": -1}, "max_gaussians -1"),
+    ({"min_opacity": 2.0}, "--min-opacity 2"),
+)
+
 
 @pytest.fixture
 def worker(tmp_path):
@@ -56,10 +67,42 @@ def test_what_a_killed_worker_wrote_is_removed_and_results_before_it_stay(worker
     record = worker.run(own).record
     results = LocalResults(tmp_path / "out" / "a")
     if began:
-        write_record(results, {"id": "a", "hash": record["hash"], "status": "started"})
+        write_record(results, {"id": "a", "hash": record["hash"], "status": "writing"})
     assert record_killed(own, worker.settings).record["status"] == "failed"
     assert read_record(results)["hash"] == record["hash"]
     assert [results.exists(name) for name in ("scene.ply", "picture.jpg")] == [not began] * 2
+
+
+def test_a_scene_that_fails_keeps_its_older_results_until_there_are_new_ones(worker, own, tmp_path):
+    """Only the reconstruction finds that no image has the number that is selected."""
+    done = worker.run(own).record
+    results, failing = LocalResults(tmp_path / "out" / "a"), Scene("a", own.images, options={"select": "99"})
+    before = results.read("scene.ply")
+    failed, _ = worker.run(failing)
+    assert failed["status"] == "failed"
+    assert failed == read_record(results)
+    assert (failed["files"], results.read("scene.ply")) == (done["files"], before)
+    assert worker.run(failing) == (failed, False)
+    # Splats of another format replace those that the failure has left.
+    assert Worker(replace(worker.settings, splat_format="spz")).run(own).record["status"] == "done"
+    assert sorted(path.name for path in results.folder.iterdir()) == ["picture.jpg", "record.json", "scene.spz"]
+
+
+def test_what_a_killed_worker_wrote_is_removed_before_the_next_attempt(worker, own, tmp_path):
+    worker.run(own)
+    results = LocalResults(tmp_path / "out" / "a")
+    write_record(results, {"id": "a", "hash": "of others", "status": "writing"})
+    assert worker.run(replace(own, images=tmp_path / "missing")).record["status"] == "failed"
+    assert not any(results.exists(name) for name in ("scene.ply", "picture.jpg"))
+
+
+def test_a_worker_that_is_killed_before_it_writes_leaves_older_results(worker, own, tmp_path):
+    record = worker.run(own).record
+    results = LocalResults(tmp_path / "out" / "a")
+    write_record(results, {"id": "a", "hash": "of others", "status": "started", "files": record["files"]})
+    killed = record_killed(own, worker.settings).record
+    assert (killed["hash"], killed["files"]) == ("of others", record["files"])
+    assert all(results.exists(name) for name in ("scene.ply", "picture.jpg"))
 
 
 def test_splats_do_not_stand_beside_the_record_of_a_failure(worker, own, tmp_path):
@@ -139,8 +182,9 @@ def test_nothing_of_others_is_replaced_and_nothing_stands_among_inputs(own, tmp_
     for target, said in ((out, "did not write it"), (scenes / "out", "is an input"), (scenes, "is an input")):
         with pytest.raises(InputError, match=said):
             batch(scenes, target, model=tmp_path / "tiny.onnx")
-    with pytest.raises(InputError, match="unknown option 'nears'"):
-        batch(scenes, tmp_path / "new", options={"nears": 1})
+    for options, said in WRONG:
+        with pytest.raises(InputError, match=said):
+            batch(scenes, tmp_path / "new", options=options)
     with pytest.raises(InputError, match="--engine dask: expected local or ray"):
         batch(scenes, tmp_path / "new", engine="dask")
     assert not (tmp_path / "new").exists()

@@ -13,8 +13,9 @@ from conftest import SMALL, SMALL_PRESET, run_command
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.inference.providers import CPU, DOCUMENTATION_ALONE, PROVIDERS, is_installed
 from idesplat.runtime.inference.session import SessionConfig, open_session
+from idesplat.tools.benchmark import batch, runner, training
 from idesplat.tools.benchmark import cli as bench
-from idesplat.tools.benchmark import runner, training
+from idesplat.tools.benchmark.batch_kills import check_kills
 from idesplat.tools.benchmark.report import Row, compare, read_rows, write_rows
 from idesplat.tools.benchmark.worker import (
     Failed,
@@ -27,6 +28,7 @@ from idesplat.tools.benchmark.worker import (
     last_kernels,
 )
 from onnx import TensorProto, helper, numpy_helper
+from tiny_model import write_model
 
 USUAL = ("--sizes", "64x96", "--repeats", "2", "--threads", "1")
 
@@ -183,12 +185,21 @@ def a_row(**changes) -> Row:
         ({"peak_bytes": 1040}, []),
         ({"peak_bytes": 1100}, ["more memory"]),
         ({"seconds": [9.0] * 4, "peak_bytes": 9000}, ["slower", "more memory"]),
-        ({"seconds": [9.0] * 4, "views": 3}, []),  # another workload
+        ({"seconds": [], "gemm_rates": [], "problem": "it crashed"}, ["can no longer be measured"]),
     ],
 )
 def test_regressions_are_beyond_noise(changes, expected):
     row = a_row(**changes)
     assert compare([row], [a_row()]) == [f"{row.name}: {verdict}" for verdict in expected]
+
+
+def test_rows_of_one_benchmark_alone_are_named(capsys):
+    both, new, old = a_row(), a_row(views=3), a_row(views=4)
+    assert compare([both, new], [both, old]) == []
+    warnings = capsys.readouterr().err.splitlines()
+    assert [line.partition(": ")[0] for line in warnings] == [new.name, old.name]
+    with pytest.raises(InputError, match="none of its rows is measured here"):
+        compare([new], [old])
 
 
 def test_a_small_steady_slowdown_is_within_tolerance():
@@ -252,6 +263,9 @@ def test_the_reason_is_printed_when_nothing_can_be_measured(exported, capsys):
         (("nowhere.onnx",), "nowhere.onnx: no such model"),
         (("--json", "/proc/nowhere/bench.json"), "cannot write into /proc"),
         (("--compare", "nowhere.json"), "nowhere.json: cannot be read"),
+        (("--training", "model.onnx"), "--training and MODELS: expected one of them"),
+        (("--training", "--json", "bench.json"), "--training and --json: expected one of them"),
+        (("--training", "--compare", "bench.json"), "--training and --compare: expected one of them"),
     ],
 )
 def test_invalid_input_is_one_line(arguments, expected, tmp_path, monkeypatch, capsys):
@@ -291,6 +305,22 @@ def test_the_environment_is_restored(monkeypatch):
         assert (os.environ["OMP_NUM_THREADS"], os.environ["MKL_NUM_THREADS"]) == ("3", "3")
     assert os.environ["OMP_NUM_THREADS"] == "7"
     assert "MKL_NUM_THREADS" not in os.environ
+
+
+# ---- batches
+
+
+def test_a_folder_with_results_is_not_measured_again(tmp_path, capsys):
+    (tmp_path / "local-2-3").mkdir()
+    assert run_command(batch.main, tmp_path, "--scenes", "3") == 2
+    assert "local-2-3: results are there already" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_scenes_that_fail_without_kills_are_not_killed(tmp_path):
+    (tmp_path / "scenes" / "empty").mkdir(parents=True)
+    with pytest.raises(InputError, match="without kills the batch ends with status 3"):
+        check_kills(tmp_path / "scenes", tmp_path / "out", moments=1, seed=0, model=write_model(tmp_path / "tiny.onnx"))
 
 
 # ---- execution providers

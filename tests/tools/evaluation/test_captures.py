@@ -23,7 +23,7 @@ from idesplat.runtime.views.exposure import Exposure
 from idesplat.runtime.views.exposure_mode import ExposureMode
 from idesplat.tools.evaluation import evaluate as library
 from idesplat.tools.evaluation.captures import capture as captures
-from idesplat.tools.evaluation.captures import checkouts, spoiled
+from idesplat.tools.evaluation.captures import checkouts, choose, spoiled
 from idesplat.tools.evaluation.captures.capture import CaptureImages, parse_view_counts, read_captures
 from idesplat.tools.evaluation.captures.checkouts import extract, fetch_checkout, find_checkout, list_folder
 from idesplat.tools.evaluation.captures.choose import as_json, camera_entries
@@ -363,6 +363,14 @@ def test_bad_frames_are_found_and_good_ones_are_not(
         (row,) = [line for line in printed.splitlines() if kind in line]
         beside, alone, tried = (int(word) for word in row.replace(kind, "").split() if word.isdigit())
         assert beside == alone == tried > 0
+
+
+@pytest.mark.parametrize("module", [spoiled, choose])
+def test_an_unknown_capture_is_refused_before_anything_is_read(module: Any, tmp_path: Path, capsys: Capsys) -> None:
+    work = ("--work", tmp_path / "work") if module is choose else ()
+    assert run_command(module.main, "--checkouts", tmp_path / "none", "--capture", "nowhere", *work) == 2
+    assert "--capture nowhere: no such capture; expected one of " in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_pixels_outside_the_lens_image_are_invalid(capture_file: Path, scene: Path) -> None:

@@ -1,6 +1,7 @@
 """Chunks and evaluation indices of the released datasets: valid ones, and damaged or malformed ones."""
 
 import pickle
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -127,8 +128,19 @@ def change(field: str, value: Any) -> Callable[[dict[str, Any]], None]:
 BAD = {
     "no key": (lambda scene: scene.pop("key"), "key"),
     "a key that leads elsewhere": (change("key", "../a"), "key"),
-    "no cameras": (lambda scene: scene.pop("cameras"), "cameras is NoneType"),
-    "short rows": (lambda scene: scene.update(cameras=scene["cameras"][:, :17]), r"cameras is \[5, 17\]"),
+    "no cameras": (lambda scene: scene.pop("cameras"), "cameras is no dense tensor"),
+    "short rows": (lambda scene: scene.update(cameras=scene["cameras"][:, :17]), r"cameras is float32 \[5, 17\]"),
+    "whole numbers": (lambda scene: scene.update(cameras=scene["cameras"].int()), "cameras is int32"),
+    "bfloat16": (lambda scene: scene.update(cameras=scene["cameras"].bfloat16()), "cameras is no dense tensor"),
+    "sparse": (lambda scene: scene.update(cameras=scene["cameras"].to_sparse()), "cameras is no dense tensor"),
+    "a gradient": (lambda scene: scene["cameras"].requires_grad_(), "cameras is no dense tensor"),
+    "no values": (lambda scene: scene.update(cameras=scene["cameras"].to("meta")), "cameras is no dense tensor"),
+    "an image without values": (
+        change("images", [torch.zeros(9, dtype=torch.uint8, device="meta")] * 5),
+        r"images\[0\]",
+    ),
+    "a sparse image": (change("images", [torch.ones(9, dtype=torch.uint8).to_sparse()] * 5), r"images\[0\]"),
+    "a byte repeated": (change("images", [torch.zeros(1, dtype=torch.uint8).expand(10**12)] * 5), r"images\[0\]"),
     "no images": (lambda scene: scene.pop("images"), "images is NoneType"),
     "fewer images": (lambda scene: scene["images"].pop(), "images is 4, expected one for each of 5"),
     "decoded images": (change("images", [torch.zeros(3, 4, 4)] * 5), r"images\[0\]"),
@@ -162,6 +174,16 @@ def test_refuses_damaged_chunks(folder: Path) -> None:
         path.write_bytes(content)
         with pytest.raises(InputError, match="damaged"):
             read_chunk(path)
+
+
+def test_a_packed_chunk_is_refused_before_it_is_unpacked(tmp_path: Path) -> None:
+    path = tmp_path / "packed.torch"
+    torch.save([{"key": "a", "cameras": torch.zeros(1 << 20)}], tmp_path / "plain.pth")
+    with zipfile.ZipFile(tmp_path / "plain.pth") as plain, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as packed:
+        for name in plain.namelist():
+            packed.writestr(name, plain.read(name))
+    with pytest.raises(InputError, match="claims to hold"):
+        read_chunk(path)
 
 
 def test_an_index_of_another_dataset(folder: Path) -> None:

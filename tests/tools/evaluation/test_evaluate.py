@@ -26,6 +26,8 @@ from idesplat.tools.evaluation.cases import synthetic_case
 from idesplat.tools.evaluation.chunks import IndexEntry, chunk_cases
 from idesplat.tools.evaluation.cli import main
 from idesplat.tools.evaluation.image_folders import load_case
+from idesplat.tools.evaluation.novel_views import Result, Target, mean_of_scenes, mean_of_views
+from idesplat.tools.evaluation.report import print_means, print_views
 from idesplat.tools.synthetic.sampler import HELD_OUT_SEEDS, generate_sample
 from skimage.metrics import structural_similarity
 from test_chunks import as_scene
@@ -296,3 +298,17 @@ def test_invalid_input_is_one_line_and_leaves_files_untouched(name: str, workpla
     assert len(lines) == 1
     assert expected in lines[0]
     assert {path: path.stat().st_mtime_ns for path in workplace.rglob("*")} == before
+
+
+def test_means_are_over_the_cases_that_have_a_method(capsys: pytest.CaptureFixture[str]) -> None:
+    """True depth that is complete for some cases alone gives these alone an oracle of depth."""
+    without = Target("a.png", {"model": {"psnr": 20.0}}, {})
+    with_depth = Target("b.png", {"model": {"psnr": 30.0, "ssim": 0.5}, "oracle_depth": {"psnr": 40.0}}, {})
+    results = [Result(target.name, ["c.png"], 1, 2, [target], {}) for target in (without, with_depth)]
+    for means in (mean_of_views(results), mean_of_scenes(results)):
+        assert means == {"model": {"psnr": 25.0, "ssim": 0.5}, "oracle_depth": {"psnr": 40.0}}
+        print_means(means, "2 views")
+    print_views(results)
+    printed = capsys.readouterr().out
+    (row,) = [line for line in printed.splitlines() if "a.png" in line]
+    assert "20.00" in row and "oracle depth" in printed and "40.00" in printed

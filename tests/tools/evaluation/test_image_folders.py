@@ -77,6 +77,7 @@ def test_context_lies_around_the_target() -> None:
         (["0006"], ["0007"], 2, "expected at least 2"),
         ([], ["0007"], 9, "too few are left for a context of 9"),
         ([], [], 9, "too few are left for a context of 9"),
+        ([], [], 1, "--views 1: expected at least 2"),
     ],
 )
 def test_refuses_splits_that_cannot_be_made(context: list[str], targets: list[str], views: int, expected: str) -> None:
@@ -100,6 +101,16 @@ def test_images_are_prepared_as_for_inference(scene: Path) -> None:
     K = views.cameras[2].K
     np.testing.assert_allclose(case.targets.K(0)[0, 0], 0.75 * K[0, 0], rtol=1e-6)
     np.testing.assert_allclose(case.targets.K(0)[1, 2], 64 / 96 * K[1, 2], rtol=1e-6)
+
+
+def test_a_case_of_many_images_has_a_short_name_of_its_own(scene: Path, tmp_path: Path) -> None:
+    frames = []
+    for number, (path, camera) in enumerate(frames_of(scene)):
+        frames.append((tmp_path / f"{number}{'é' * 60}.png", camera))
+        shutil.copy(path, frames[-1][0])
+    first, second = (load_case(frames, [0, other, 4], [2], SIZE, find_range).name for other in (1, 3))
+    assert len(first.encode()) <= 100 and first != second
+    assert first.startswith("0é") and "+4é" in first and "-3-" in first
 
 
 def test_black_borders_are_invalid(scene: Path, tmp_path: Path) -> None:

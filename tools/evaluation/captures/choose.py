@@ -53,6 +53,9 @@ def choose_captures(
     before = json.loads(CAPTURES_FILE.read_text())["captures"] if CAPTURES_FILE.exists() else []
     entries = {entry["name"]: entry for entry in before}
     order = [recipe.name for recipe in RECIPES]
+    for name in capture or ():
+        if name not in order:
+            raise InputError(f"--capture {name}: no such capture; expected one of {', '.join(order)}")
     for recipe in RECIPES:
         if not capture or recipe.name in capture:
             entries[recipe.name] = _choose(recipe, checkouts, work)

@@ -43,9 +43,10 @@ MOVED = ("can",)  # captures whose object was moved between the images, as their
 def count_spoiled(
     checkouts: Annotated[Path, typer.Option(help="Folder of checkouts; missing ones are cloned into it.")],
     capture: Annotated[list[str] | None, typer.Option(help="Use this capture alone; may be repeated.")] = None,
-    frames: Annotated[int, typer.Option(help="Frames of each capture that are made bad.", min=1)] = 4,
+    frames: Annotated[int, typer.Option(help="Frames of each capture that are made bad.", min=2)] = 4,
 ) -> None:
     """Count false alarms and detections of the checks of images."""
+    read_captures(capture or ())  # an unknown one is refused before all are loaded
     named = {source.name: _load(source, checkouts) for source in read_captures()}
     counts: dict[str, list[int]] = defaultdict(lambda: [0, 0, 0])  # found beside others, found alone, tried
     alarms = np.zeros(2, int)
