@@ -109,9 +109,6 @@ def _check_depth_range(depth_range: tuple[float, float]) -> None:
         raise InputError(f"the depth range is {depth_range}, expected 0 < near < far")
 
 
-MAX_SIDE = 1_000_000  # pixels
-
-
 def named_from(folder: Path, cameras: Sequence[Camera], frames: Path | None = None) -> list[Camera]:
     """The cameras, their images named as seen from a folder, where they are files.
 
@@ -122,7 +119,8 @@ def named_from(folder: Path, cameras: Sequence[Camera], frames: Path | None = No
         if Path(camera.name).parent == frames:
             camera = replace(camera, name=Path(camera.name).name)
         elif Path(camera.name).is_file():
-            name = os.path.realpath(camera.name)
+            path = Path(camera.name)  # of a link its own name, by which cameras are matched
+            name = os.path.join(os.path.realpath(path.parent), path.name)
             with suppress(ValueError):  # on another drive of Windows
                 name = os.path.relpath(name, os.path.realpath(folder))
             camera = replace(camera, name=Path(name).as_posix())

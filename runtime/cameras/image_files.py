@@ -55,7 +55,7 @@ class ImageSizes:
         given = self._given.get(image_stem(PurePosixPath(name.replace("\\", "/"))))
         candidates = [] if given is None else [given]
         for candidate in (*candidates, *candidate_paths(self.folder, name)):
-            if candidate.is_file():
+            if os.path.isfile(candidate):  # a name may be too long for a file's
                 return image_size(candidate)
         return None
 

@@ -18,7 +18,8 @@ from .terminal import HELP_OPTIONS, run, say
 if TYPE_CHECKING:
     from ..cameras.camera import Camera
 
-OUT_HELP = "JSON to write: our own, or nerfstudio's layout if it is called transforms.json."
+TRANSFORMS = "transforms.json"
+OUT_HELP = f"JSON to write: our own, or nerfstudio's layout if it is called {TRANSFORMS}."
 
 app = typer.Typer(
     add_completion=False,
@@ -93,6 +94,9 @@ def convert(
     outputs().writes("", [out])
     found = read_cameras(cameras, find_images(given) if given else (), camera_format)
     write_cameras(out, found)
+    ranges = sum(camera.depth_range is not None for camera in found)
+    if ranges and out.name == TRANSFORMS:
+        note(f"note: a {TRANSFORMS} does not hold depth ranges; those of {ranges} cameras were left out")
     note(f"read {len(found)} cameras as {camera_format or detect_format(cameras)}: {_lenses(found)}")
     say(f"wrote {out}")
 

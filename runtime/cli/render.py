@@ -46,6 +46,7 @@ from .terminal import run, say
 
 COMMAND = "idesplat render"
 COLOUR = ""  # beside DEPTH and ALPHA: the endings of the names of the kinds of images
+FRAMES, FPS = 90, 30.0  # by default
 SIZE = "360x640"  # without cameras and --size
 MOST_LISTED = 12  # files that are named one by one
 
@@ -64,17 +65,24 @@ def render(
         float | None, typer.Option(help="Of the orbit: 360 by default, with cameras a swing of 30.", show_default=False)
     ] = None,
     frames: Annotated[
-        int,
+        int | None,
         typer.Option(
-            help=f"How many images --orbit and --path make, 1 to {MAX_FRAMES}.", parser=parse_count, metavar="INTEGER"
+            help=f"How many images --orbit and --path make, 1 to {MAX_FRAMES}; {FRAMES} by default.",
+            parser=parse_count,
+            metavar="INTEGER",
+            show_default=False,
         ),
-    ] = 90,
-    fps: Annotated[float, typer.Option(help="Frames a second of an .mp4.")] = 30,
+    ] = None,
+    fps: Annotated[
+        float | None, typer.Option(help=f"Frames a second of an .mp4; {FPS} by default.", show_default=False)
+    ] = None,
     size: Annotated[
         str | None,
         typer.Option(help=f"HEIGHTxWIDTH to render at; else the cameras' sizes, or {SIZE}.", show_default=False),
     ] = None,
-    depth: Annotated[bool, typer.Option("--depth", help="Render depth, too (colours, and metric .npz).")] = False,
+    depth: Annotated[
+        bool, typer.Option("--depth", help="Render depth, too (colours; of images also metric .npz).")
+    ] = False,
     alpha: Annotated[bool, typer.Option("--alpha", help="Render opacity, too.")] = False,
     background: Annotated[
         str, typer.Option(help="Red, green and blue behind the scene, 0 to 1, such as 1,1,1.", metavar="R,G,B")
@@ -106,11 +114,20 @@ def render(
     """
     colour = _parse_background(background)
     lens = _parse_lens(aperture, focus)
+    if out.suffix.lower() == IMAGE:
+        out = out.with_suffix(IMAGE)
+    _check_out(out)
+    if frames is not None and not (orbit or path):
+        raise InputError(f"--frames {frames}: is of --orbit and --path; add one of them")
+    if fps is not None and out.suffix.lower() != VIDEO:
+        raise InputError(f"--fps {fps:g}: is of a video; give an --out that ends in {VIDEO}")
+    if camera_format is not None and cameras is None:
+        raise InputError(f"--camera-format {camera_format}: is of --cameras; add it")
+    frames, fps = FRAMES if frames is None else frames, FPS if fps is None else fps
     if not 1 <= fps <= 1000:
         raise InputError(f"--fps {fps:g}: expected frames a second, 1 to 1000")
     if not 1 <= frames <= MAX_FRAMES:
         raise InputError(f"--frames {frames}: expected 1 to {MAX_FRAMES} images")
-    _check_out(out)
     if path and orbit:
         raise InputError("--path and --orbit: expected one of them")
     if degrees is not None and not orbit:

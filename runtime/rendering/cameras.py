@@ -20,6 +20,7 @@ MIN_OPACITY = 0.1  # of Gaussians that count as part of the scene
 OUTLIERS = 5  # percent of the scene at either end of an axis that may lie outside the image
 SCENE_ORBIT_DEG = 360.0  # of an orbit from the overview
 CAMERA_ORBIT_DEG = 30.0  # of an orbit about what cameras look at: none of them has seen its back
+LEAST_DOWN = 1e-3  # length of the mean of unit vectors, below which it tells no direction
 FOCUS_SIDE = 96  # pixels, longer side of the rendering that `focus_depth` measures
 OVERVIEW_NAME = "still"
 MAX_FRAMES = 10_000  # of a path or an orbit: five minutes of video at 30 frames a second, and numbers of four digits
@@ -59,11 +60,15 @@ def path_cameras(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 def orbit_cameras(gaussians: Gaussians, cameras: Sequence[Camera], degrees: float, frames: int) -> list[Camera]:
     """Cameras on an orbit about what the middle one looks at, around the mean up direction of the given cameras.
 
+    Where their directions cancel, around that of the middle one.
+
     degrees: 360 for a full turn; less for a swing to both sides that ends where it begins (`orbit_extrinsics`).
     Raises InputError if the middle camera sees nothing.
     """
     middle = cameras[len(cameras) // 2]
     down = np.mean([camera.extrinsics[:3, 1] for camera in cameras], axis=0)
+    if np.linalg.norm(down) < LEAST_DOWN:
+        down = middle.extrinsics[:3, 1]
     pivot = middle.extrinsics[:3, 3] + focus_depth(gaussians, middle) * middle.extrinsics[:3, 2]
     poses = orbit_extrinsics(middle.extrinsics, pivot, -down, degrees, frames)
     return _frames(poses, middle.K, middle.width, middle.height)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import InputError
 from ..images.colormaps import srgb_to_linear, to_uint8
 from ..system.files import atomic_write
 from .axes import GLTF
@@ -76,6 +77,8 @@ def write_point_cloud(path: Path, cloud: PointCloud) -> None:
     """Write points in the format of the path's suffix; raises InputError if the file cannot be written."""
     import trimesh
 
+    if path.suffix.lower() == ".glb" and not len(cloud):
+        raise InputError(f"cannot write {path}: there are no points, and a .glb has no empty arrays")
     with atomic_write(path) as temporary:
         if path.suffix.lower() == ".xyz":
             np.savetxt(temporary, np.column_stack([cloud.positions, cloud.colours]), "%.9g %.9g %.9g %d %d %d")

@@ -1,5 +1,6 @@
 """The input images: image files, frames extracted from a video, or the images that a camera file names."""
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -54,4 +55,4 @@ def _images_of_cameras(cameras: Path | None, camera_format: CameraFormat | None)
 
 def _find(folder: Path, name: str) -> Path | None:
     """The image of this name, which may lack the suffix, in a folder."""
-    return next((path for path in candidate_paths(folder, name) if path.is_file()), None)
+    return next((path for path in candidate_paths(folder, name) if os.path.isfile(path)), None)

@@ -15,7 +15,7 @@ ARRAYS = ("means", "scales", "quats", "opacities", "sh")
 
 
 SORTED = (".compressed.ply", ".sog")  # these order Gaussians by place
-NEVER_EMPTY = (".glb", ".sog")
+NEVER_EMPTY = (".splat", ".glb", ".sog")
 
 
 class Bounds(NamedTuple):

@@ -8,9 +8,14 @@ def round_to_uint8(values: np.ndarray) -> np.ndarray:
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
+# Of a limit: values that were read from a file lie up to float32's rounding beyond it.
+LEAST_CHANGE = 1e-6
+
+
 def clipped_note(name: str, values: np.ndarray, low: float, high: float) -> list[str]:
     """A line about the values outside a format's range, which are clipped; no line if there are none."""
-    count = int(np.count_nonzero((values < low) | (values > high)))
+    least, most = low - LEAST_CHANGE * abs(low), high + LEAST_CHANGE * abs(high)
+    count = int(np.count_nonzero((values < least) | (values > most)))
     return [f"{count:,} of {values.size:,} {name} outside {low:.3g} to {high:.3g} were clipped"] if count else []
 
 

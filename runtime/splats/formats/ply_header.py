@@ -112,10 +112,11 @@ def header_offset(path: Path) -> np.ndarray:
     try:
         with open_regular(Path(path)) as file:
             while file.tell() < MAX_HEADER_BYTES:
-                words = file.readline(MAX_HEADER_BYTES).decode("ascii", errors="replace").split()
+                line = file.readline(MAX_HEADER_BYTES)
+                words = line.decode("ascii", errors="replace").split()
                 if words[:2] == ["comment", OFFSET] and len(words) == 5:
                     return checked_offset(path, words[2:])
-                if not words or words == ["end_header"]:
+                if not line or words == ["end_header"]:
                     break
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}; expected a splat file (.ply)") from None

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import raise_input_error
+from ...errors import InputError, raise_input_error
 from ...geometry.quaternions import normalize_quaternions
 from ...system.files import atomic_write, read_bytes
 from ..gaussians import Gaussians, check_finite, check_ranges, with_colours
@@ -27,6 +27,8 @@ def write_splat(path: Path, gaussians: Gaussians, offset: np.ndarray | None = No
     """
     check_ranges(path, gaussians)
     check_finite(path, gaussians)
+    if not len(gaussians):
+        raise InputError(f"cannot write {path}: there are no Gaussians, and a .splat without any is an empty file")
     records = np.empty(len(gaussians), RECORD)
     records["mean"] = gaussians.means
     records["scale"] = gaussians.scales

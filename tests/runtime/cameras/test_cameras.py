@@ -3,13 +3,14 @@
 import copy
 import json
 import math
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from idesplat.runtime.cameras.camera import Camera, resize_camera
+from idesplat.runtime.cameras.camera import Camera, named_from, resize_camera
 from idesplat.runtime.cameras.io import CameraFormat, read_cameras, write_cameras
 from idesplat.runtime.errors import InputError
 
@@ -22,6 +23,16 @@ def pose(angles, position):
     matrix[:3, :3] = cv2.Rodrigues(np.array(angles, dtype=float))[0]
     matrix[:3, 3] = position
     return matrix
+
+
+def test_a_linked_image_keeps_the_name_of_its_link(tmp_path: Path) -> None:
+    """As datasets of links have them: images are matched to cameras by that name."""
+    for folder in ("store", "photos"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "store" / "9f3a.jpg").write_bytes(b"")
+    (tmp_path / "photos" / "a.jpg").symlink_to("../store/9f3a.jpg")
+    camera = Camera(str(tmp_path / "photos" / "a.jpg"), 8, 8, np.diag([8.0, 8, 1]), np.eye(4))
+    assert named_from(tmp_path, [camera])[0].name == "photos/a.jpg"
 
 
 @pytest.fixture

@@ -36,6 +36,19 @@ def test_depth_ranges_go_along(folder):
     assert json.loads(Path("cameras.json").read_text())["cameras"][1]["depth_range"] == [1.5, 15.0]
 
 
+def test_depth_ranges_that_a_file_does_not_hold_are_noted(folder, capsys):
+    np.save("poses_bounds.npy", as_llff(known(["0", "1"], CENTRED), (2.0, 10.0)))
+    assert run_command(main, "convert", "poses_bounds.npy", "transforms.json") == 0
+    assert "does not hold depth ranges; those of 2 cameras were left out" in capsys.readouterr().out
+
+
+def test_a_name_that_no_file_can_have_is_no_image(folder, capsys):
+    frame = {"file_path": "a" * 300 + ".png", "transform_matrix": np.eye(4).tolist(), "fl_x": 9, "fl_y": 9}
+    Path("transforms.json").write_text(json.dumps({"frames": [frame]}))
+    assert run_command(main, "convert", "transforms.json", "cameras.json") == 2
+    assert "transforms.json" in capsys.readouterr().err
+
+
 def test_images_give_the_size(folder, capsys):
     cameras = known(["100", "200"])
     Path("trajectory.txt").write_text(as_re10k(cameras))

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -254,6 +255,13 @@ def test_an_orbit_keeps_looking_at_its_pivot() -> None:
             orbit_extrinsics(start, pivot, np.array([0, -1.0, 0]), degrees, frames)
 
 
+def test_an_orbit_of_cameras_that_are_upside_down_to_each_other(tmp_path: Path) -> None:
+    upright = Camera("a", 32, 32, pinhole(32, 32), pose((0, 0, 0), (0, 0, -4)))
+    turned = replace(upright, extrinsics=upright.extrinsics @ np.diag([-1.0, -1, 1, 1]))
+    found = orbit_cameras(a_ball_of_gaussians((0, 0, 0)), [upright, turned], 30, 4)
+    assert all(np.isfinite(camera.extrinsics).all() for camera in found)
+
+
 def test_an_orbit_goes_around_what_the_cameras_look_at() -> None:
     ball = a_ball_of_gaussians((0, 0, 0))
     cameras = [Camera(f"{x}", 40, 30, pinhole(40, 30), pose((0, 0, 0), (x, 0, -4))) for x in (-0.1, 0.0, 0.1)]
@@ -285,6 +293,16 @@ def test_a_still_without_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     expected = render_view(a_ball_of_gaussians(), camera.extrinsics, camera.K, 64, 48).rgb
     assert psnr(image, expected) > 45
     assert {path.name for path in tmp_path.iterdir()} == {"scene.ply", "still.png"}
+
+
+def test_capital_endings_are_written_in_small_letters(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_ply(Path("scene.ply"), a_ball_of_gaussians())
+    assert run(monkeypatch, "scene.ply", "--out", "Shot.PNG", "--size", "32x48") == 0
+    assert "Shot.PNG" not in capsys.readouterr().out
+    assert Path("Shot.png").is_file()
 
 
 def test_depth_and_alpha_beside_the_colours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -359,6 +377,9 @@ def test_a_path_through_the_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (("--out", "out", "--orbit", "--degrees", "400"), "expected one frame, 0 to 360 degrees"),
         (("--out", "out", "--orbit", "--degrees", "0"), "expected one frame, 0 to 360 degrees"),
         (("--out", "out", "--degrees", "20"), "--degrees 20: is of the orbit; add --orbit"),
+        (("--out", "out", "--frames", "5"), "--frames 5: is of --orbit and --path"),
+        (("--out", "out", "--orbit", "--fps", "5"), "--fps 5: is of a video"),
+        (("--out", "out", "--camera-format", "colmap"), "--camera-format colmap: is of --cameras"),
         (("--out", "a.mp4", "--fps", "0.0004"), "--fps 0.0004: expected frames a second"),
         (("--out", "a.mp4", "--cameras", "cameras.json"), "a video has one size; add --size"),
         (("--out", "a.png", "--cameras", "cameras.json"), "2 images do not fit one file"),
