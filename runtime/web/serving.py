@@ -1,6 +1,7 @@
 """A server for the page's folder on this machine."""
 
 import functools
+import sys
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,15 @@ class PageHandler(SimpleHTTPRequestHandler):
         """Say nothing."""
 
 
+class PageServer(ThreadingHTTPServer):
+    """Says nothing of clients that close their connection, as browsers do with a page that is left."""
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Print the traceback of other errors."""
+        if not isinstance(sys.exception(), ConnectionError):
+            super().handle_error(request, client_address)
+
+
 def page_server(folder: Path, host: str, port: int) -> ThreadingHTTPServer:
     """A server of a folder; `serve_forever` runs it. Raises OSError if the port is in use."""
-    return ThreadingHTTPServer((host, port), functools.partial(PageHandler, directory=str(folder)))
+    return PageServer((host, port), functools.partial(PageHandler, directory=str(folder)))

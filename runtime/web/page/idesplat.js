@@ -9,11 +9,14 @@ import { parseColmap } from "./modules/colmap.js";
 import { InputError } from "./modules/errors.js";
 import { toPly, toSpz } from "./modules/splat_files.js";
 
+const STOPPED = "stopped";
+
 export { InputError, parseColmap, toPly, toSpz };
 
 /** @type {import("./idesplat.d.ts").reconstruct} */
 export function reconstruct(files, cameras, options = {}) {
   const { provider = null, near, far, focal, onProgress = () => {}, signal } = options;
+  if (signal?.aborted) return Promise.reject(new InputError(STOPPED)); // its event does not come again
   const worker = new Worker(new URL("./worker.js", import.meta.url), { type: "module" });
   const done = new Promise((resolve, reject) => {
     worker.onerror = (event) => reject(new InputError(`the worker failed (${event.message}); reload the page`));
@@ -22,7 +25,7 @@ export function reconstruct(files, cameras, options = {}) {
       else if (data.kind === "error") reject(new InputError(data.message));
       else resolve({ ...data.result, ply: toPly(data.result.gaussians) });
     };
-    signal?.addEventListener("abort", () => reject(new InputError("stopped")));
+    signal?.addEventListener("abort", () => reject(new InputError(STOPPED)));
   });
   worker.postMessage({ files: [...files], cameras, options: { provider, near, far, focal } });
   return /** @type {any} */ (done.finally(() => worker.terminate()));

@@ -8,7 +8,8 @@ const RELOADED = "idesplat-reloaded"; // in sessionStorage: the page was reloade
 const MEGA = 1e6;
 
 const element = (id) => /** @type {any} */ (document.getElementById(id));
-const state = { images: [], cameraFiles: [], stop: null, viewer: null, urls: [] };
+const urls = { thumbnails: [], result: [] }; // of the blobs that the page shows now, by what they are for
+const state = { images: [], cameraFiles: [], stop: null, running: false, viewer: null };
 
 // ---- the environment
 
@@ -46,20 +47,25 @@ const filesChosen = () => state.images.length + state.cameraFiles.length > 0;
 
 function addFiles(files) {
   const { images, cameraFiles, others } = sortFiles(files);
-  const known = new Set(state.images.map((file) => file.name));
-  state.images.push(...images.filter((file) => !known.has(file.name)));
-  const replaced = new Set(cameraFiles.map((file) => file.name));
-  state.cameraFiles = [...state.cameraFiles.filter((file) => !replaced.has(file.name)), ...cameraFiles];
+  state.images = replaced(state.images, images);
+  state.cameraFiles = replaced(state.cameraFiles, cameraFiles);
   showError(others.length > 0 ? `${others[0].name}: is neither an image nor a file with cameras; left out` : null);
   showFiles();
 }
 
+/** Both lists of files; of those with the same name, the added one. */
+function replaced(files, added) {
+  const names = new Set(added.map((file) => file.name));
+  return [...files.filter((file) => !names.has(file.name)), ...added];
+}
+
 function showFiles() {
-  const items = state.images.map((file) => {
+  const thumbnails = urlsOf("thumbnails", state.images);
+  const items = state.images.map((file, index) => {
     const item = document.createElement("li");
     const image = document.createElement("img");
     image.alt = "";
-    image.src = keepUrl(file);
+    image.src = thumbnails[index];
     item.append(image, file.name);
     item.title = file.name;
     return item;
@@ -70,18 +76,19 @@ function showFiles() {
   const cameras = names ? `Cameras: ${names}` : "No cameras: they are estimated from the images.";
   element("cameras").textContent = chosen ? `${state.images.length} images. ${cameras}` : "";
   element("focal-row").hidden = state.images.length === 0 || names !== "";
-  element("start").disabled = !chosen;
+  element("start").disabled = state.running || !chosen;
   element("clear").hidden = !chosen;
 }
 
-function keepUrl(blob) {
-  const url = URL.createObjectURL(blob);
-  state.urls.push(url);
-  return url;
+/** URLs of the blobs, in place of those before for the same use, which kept their blobs in memory. */
+function urlsOf(use, blobs) {
+  urls[use].forEach((url) => URL.revokeObjectURL(url));
+  urls[use] = blobs.map((blob) => URL.createObjectURL(blob));
+  return urls[use];
 }
 
 function clear() {
-  state.urls.splice(0).forEach((url) => URL.revokeObjectURL(url));
+  urlsOf("result", []);
   state.viewer?.dispose();
   Object.assign(state, { images: [], cameraFiles: [], viewer: null });
   element("files").value = "";
@@ -118,6 +125,7 @@ async function start() {
 }
 
 function setRunning(running) {
+  state.running = running;
   element("progress").hidden = !running;
   element("stop").hidden = !running;
   element("start").disabled = running || !filesChosen();
@@ -134,8 +142,9 @@ function showProgress({ stage, share }) {
 
 async function showResult(result, seconds) {
   element("result").hidden = false;
-  element("ply").href = keepUrl(result.ply);
-  element("spz").href = keepUrl(await toSpz(result.gaussians));
+  const [ply, spz] = urlsOf("result", [result.ply, await toSpz(result.gaussians)]);
+  element("ply").href = ply;
+  element("spz").href = spz;
   showDepth(result);
   showNumbers(result, seconds);
   const notes = result.notes.map((line) => Object.assign(document.createElement("li"), { textContent: line }));
@@ -216,7 +225,12 @@ document.addEventListener("dragleave", () => element("drop").classList.remove("o
 document.addEventListener("drop", async (event) => {
   event.preventDefault();
   element("drop").classList.remove("over");
-  if (event.dataTransfer) addFiles(await filesOfDrop(event.dataTransfer));
+  try {
+    if (event.dataTransfer) addFiles(await filesOfDrop(event.dataTransfer));
+  } catch (error) {
+    const { message } = /** @type {Error} */ (error);
+    showError(`the dropped files cannot be read (${message}); choose them instead, or copy them to another folder`);
+  }
 });
 
 describeEnvironment().catch((error) => showError(`model.json cannot be loaded (${error}); copy the whole folder to the host`));

@@ -6,6 +6,8 @@
 // Both are filled in by `idesplat web`. FILES: what the page needs to open; the model and the engine are kept when used.
 const CACHE = "idesplat-DEVELOPMENT";
 const FILES = ["./"];
+// The browser asks the host whether its own copy is current: one of an older version does not fit the other files.
+const REVALIDATED = /** @type {const} */ ({ cache: "no-cache" });
 const HEADERS = {
   "Cross-Origin-Opener-Policy": "same-origin",
   "Cross-Origin-Embedder-Policy": "require-corp",
@@ -19,7 +21,13 @@ self.addEventListener("install", (event) => {
 
 async function keepFiles() {
   const cache = await caches.open(CACHE);
-  const keep = async (name) => cache.put(name, isolated(await fetch(name, { cache: "no-cache" })));
+  const keep = async (name) => {
+    const response = await fetch(name, REVALIDATED);
+    // An error page would be kept in place of the file until the next version.
+    const { ok, status } = response;
+    if (!ok) throw new Error(`${name}: the server answers ${status}; copy the whole folder to the host`);
+    await cache.put(name, isolated(response));
+  };
   await Promise.all(FILES.map(keep));
 }
 
@@ -43,7 +51,7 @@ async function answer(request) {
   const cache = await caches.open(CACHE);
   const kept = await cache.match(request, { ignoreSearch: true });
   if (kept) return kept;
-  const response = isolated(await fetch(request));
+  const response = isolated(await fetch(request, REVALIDATED));
   if (response.status === 200) {
     // In the background: the page need not wait for the disk, and a full one is no error.
     cache.put(request, response.clone()).catch(() => {});

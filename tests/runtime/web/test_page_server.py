@@ -23,3 +23,13 @@ def test_it_isolates_the_page_and_serves_the_folder_alone(tmp_path: Path) -> Non
         with pytest.raises(HTTPError, match="404"):
             urlopen(f"{address}/../secret")
         server.shutdown()
+
+
+@pytest.mark.parametrize(("error", "printed"), [(ConnectionResetError(), False), (ValueError("wrong"), True)])
+def test_a_client_that_closes_its_connection_prints_nothing(tmp_path: Path, capsys, error, printed: bool) -> None:
+    with page_server(tmp_path, "127.0.0.1", 0) as server:
+        try:
+            raise error
+        except type(error):
+            server.handle_error(None, ("127.0.0.1", 1))
+    assert ("Traceback" in capsys.readouterr().err) == printed

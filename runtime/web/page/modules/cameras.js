@@ -19,7 +19,12 @@ import { remap } from "./resampling.js";
 
 const PERSPECTIVE_MODELS = ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL"];
 const FISHEYE_MODEL = "OPENCV_FISHEYE";
+const PERSPECTIVE_FIELDS = ["k1", "k2", "p1", "p2", "k3"]; // in OpenCV's order
+const FISHEYE_FIELDS = ["k1", "k2", "k3", "k4"];
+const DISTORTION_FIELDS = ["k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"];
+const MIN_FIELD_OF_VIEW = 0.001; // radians
 const MAX_ROTATION_ERROR = 1e-3;
+const IMAGE_SUFFIX = /(?<=.)\.(jpe?g|jpe|jfif|png|webp|tiff?|bmp|jp2|avif|ppm|pgm|hei[cf]|hif)$/i;
 
 /**
  * The cameras of a parsed transforms.json (nerfstudio, instant-ngp).
@@ -51,20 +56,51 @@ function parseFrame(fields, name, images) {
   const width = optional("w", image?.width);
   const height = optional("h", image?.height);
   if (!(width > 0 && height > 0)) throw new InputError(`${where}: w and h are missing; add them`);
-  const model = fields.camera_model ?? "OPENCV";
-  if (![...PERSPECTIVE_MODELS, FISHEYE_MODEL].includes(model)) {
-    throw new InputError(`${where}: camera_model is ${model}, expected ${PERSPECTIVE_MODELS.join(", ")}`);
-  }
-  const fisheye = model === FISHEYE_MODEL || fields.is_fisheye === true;
+  const fisheye = isFisheye(fields, where);
   const K = intrinsics(fields, width, height, number, where);
-  const names = fisheye ? ["k1", "k2", "k3", "k4"] : ["k1", "k2", "p1", "p2", "k3"];
-  const values = names.map((field) => optional(field, 0));
-  const distortion = fisheye || values.some((value) => value !== 0) ? values : null;
+  const distortion = distortionOf(fisheye, optional, where);
   return { name, width, height, K, pose: openglPose(fields.transform_matrix, where), distortion, fisheye };
 }
 
+function isFisheye(fields, where) {
+  const models = [...PERSPECTIVE_MODELS, FISHEYE_MODEL];
+  const { camera_model: model = "OPENCV", is_fisheye: flag = false } = fields;
+  if (!models.includes(model)) {
+    const expected = `expected one of ${models.join(", ")}`;
+    throw new InputError(`${where}: camera_model is ${JSON.stringify(model)}, ${expected}; undistort the images first`);
+  }
+  if (typeof flag !== "boolean") {
+    throw new InputError(`${where}: is_fisheye is ${JSON.stringify(flag)}, expected true or false`);
+  }
+  if ("distortion_params" in fields) {
+    const advice = "write k1, k2, p1, p2, or undistort the images first";
+    throw new InputError(`${where}: distortion_params is not read; ${advice}`);
+  }
+  return flag || model === FISHEYE_MODEL;
+}
+
+/** The coefficients of the lens; null for a pinhole. */
+function distortionOf(fisheye, optional, where) {
+  const names = fisheye ? FISHEYE_FIELDS : PERSPECTIVE_FIELDS;
+  for (const field of DISTORTION_FIELDS.filter((name) => !names.includes(name))) {
+    const value = optional(field, 0);
+    if (value !== 0) {
+      const expected = `only ${names.join(", ")} for a ${fisheye ? "fisheye" : "perspective"} lens`;
+      throw new InputError(`${where}: ${field} is ${value}, expected ${expected}; undistort the images first`);
+    }
+  }
+  const values = names.map((field) => optional(field, 0));
+  return fisheye || values.some((value) => value !== 0) ? values : null; // a fisheye lens without is no pinhole either
+}
+
 function intrinsics(fields, width, height, number, where) {
-  const focal = (field, side) => (0.5 * side) / Math.tan(0.5 * number(field));
+  const focal = (field, side) => {
+    const angle = number(field);
+    if (!(MIN_FIELD_OF_VIEW < angle && angle < Math.PI)) {
+      throw new InputError(`${where}: ${field} is ${angle}, expected radians between ${MIN_FIELD_OF_VIEW} and pi`);
+    }
+    return (0.5 * side) / Math.tan(0.5 * angle);
+  };
   if (!("fl_x" in fields) && !("camera_angle_x" in fields)) {
     throw new InputError(`${where}: fl_x is missing, and camera_angle_x too; expected one of them`);
   }
@@ -99,10 +135,14 @@ export function rigid(pose, where) {
   return makePose(nearestRotation(rotation), positionOf(pose));
 }
 
-/** File name without folders and suffix. @param {string} path */
+/** File name without folders, which files written on Windows separate by backslashes. @param {string} path */
+export function fileName(path) {
+  return path.replaceAll("\\", "/").split("/").pop() ?? "";
+}
+
+/** File name without folders and the suffix of an image; other suffixes, as in r_0.5, are kept. @param {string} path */
 export function stem(path) {
-  const name = path.replaceAll("\\", "/").split("/").pop() ?? "";
-  return name.includes(".") ? name.slice(0, name.lastIndexOf(".")) : name;
+  return fileName(path).replace(IMAGE_SUFFIX, "");
 }
 
 /** The camera of the same image at another size. @param {Camera} camera */

@@ -50,12 +50,18 @@ export async function readCameraFiles(cameraFiles) {
 }
 
 async function readDocument(file) {
+  const text = await readText(file);
+  let document;
   try {
-    return JSON.parse(await readText(file));
+    document = JSON.parse(text);
   } catch (error) {
-    if (error instanceof InputError) throw error;
     throw new InputError(`${file.name}: is no JSON (${/** @type {Error} */ (error).message}); save it again`);
   }
+  if (!Array.isArray(document?.frames)) { // also null, which would mean that cameras are estimated
+    const advice = "`idesplat cameras convert` makes one of other formats";
+    throw new InputError(`${file.name}: has no list of frames, expected a transforms.json; ${advice}`);
+  }
+  return document;
 }
 
 async function readText(file) {

@@ -1,6 +1,6 @@
 /** The whole flow: image files and cameras to depth and Gaussians. */
 
-import { parseTransforms, stem } from "./cameras.js";
+import { fileName, parseTransforms, stem } from "./cameras.js";
 import { depthRange } from "./depth_range.js";
 import { InputError } from "./errors.js";
 import { estimateCameras } from "./estimation.js";
@@ -78,15 +78,8 @@ async function pairUp(files, cameras, focal, onProgress, notes) {
   const sizes = headers.map(({ width, height, orientation }, index) =>
     orientation > 4 ? { name: files[index].name, width: height, height: width } : { name: files[index].name, width, height },
   );
-  const known = Array.isArray(cameras) ? cameras : parseTransforms(cameras, sizes);
-  const pairs = [];
-  for (const file of files) {
-    const named = known.filter((camera) => stem(camera.name) === stem(file.name));
-    const exact = named.filter((camera) => camera.name.split("/").pop() === file.name);
-    const [camera] = exact.length > 0 ? exact : named;
-    if (camera) pairs.push({ file, camera });
-    else notes.push(`${file.name}: no camera names it; left out`);
-  }
+  const known = Array.isArray(cameras) ? checkedList(cameras) : parseTransforms(cameras, sizes);
+  const pairs = matchFilesToCameras(files, known, notes);
   if (pairs.length < 2) {
     const names = known.slice(0, 3).map((camera) => camera.name).join(", ");
     throw new InputError(
@@ -95,6 +88,41 @@ async function pairUp(files, cameras, focal, onProgress, notes) {
     );
   }
   return pairs;
+}
+
+/** A list of cameras, as `parseColmap` gives it; other lists, as 3DGS's cameras.json, are refused. */
+function checkedList(cameras) {
+  const known = (camera) => typeof camera?.name === "string" && Array.isArray(camera.K) && Array.isArray(camera.pose);
+  const wrong = cameras.findIndex((camera) => !known(camera));
+  if (wrong >= 0) {
+    throw new InputError(`cameras[${wrong}]: expected a camera as parseColmap gives it; give a parsed transforms.json`);
+  }
+  return cameras;
+}
+
+/** Each image with the camera that names it, one with the same suffix first; images without a camera are left out. */
+function matchFilesToCameras(files, cameras, notes) {
+  const taken = new Map();
+  for (const file of files) {
+    const named = cameras.filter((camera) => stem(camera.name) === stem(file.name));
+    const exact = named.filter((camera) => fileName(camera.name) === file.name);
+    const [camera, ...others] = exact.length > 0 ? exact : named;
+    if (!camera) {
+      notes.push(`${file.name}: no camera names it; left out`);
+      continue;
+    }
+    if (others.length > 0) {
+      const names = [camera, others[0]].map(({ name }) => name).join(", ");
+      const found = `${others.length + 1} cameras match it equally (${names})`;
+      throw new InputError(`${file.name}: ${found}, expected one; give each image a name of its own`);
+    }
+    if (taken.has(camera)) {
+      const names = `${taken.get(camera).name} and ${file.name}`;
+      throw new InputError(`${names}: both match the camera of ${camera.name}, expected one; leave one out`);
+    }
+    taken.set(camera, file);
+  }
+  return [...taken].map(([camera, file]) => ({ file, camera }));
 }
 
 /** The two views to use, at the network's size. */

@@ -104,5 +104,9 @@ function fixationDepth(cameras) {
   const total = (a, b) => a.reduce((sum, vector, index) => sum + dot(vector, b[index]), 0);
   const [pf, pp, ff] = [total(positions, forward), total(positions, positions), total(forward, forward)];
   if (pf < 0 && pf ** 2 > MIN_EXPLAINED_VARIANCE * pp * ff) return -pf / ff;
-  return DEFAULT_DEPTH * Math.max(...positions.flatMap((a) => positions.map((b) => norm(subtract(a, b)))));
+  let longest = 0; // all distances of many cameras are too many arguments for Math.max
+  for (const a of positions) {
+    for (const b of positions) longest = Math.max(longest, norm(subtract(a, b)));
+  }
+  return DEFAULT_DEPTH * longest;
 }
