@@ -38,7 +38,7 @@ def load(checkpoint: Path, preset: str | None) -> LoadedCheckpoint:
     Raises InputError if the preset is unknown, or the file is unsafe, unreadable, or fits no preset.
     """
     if preset is not None and preset not in PRESETS:
-        raise InputError(f"--preset {preset}: unknown; choose one of {', '.join(PRESETS)}")
+        raise InputError(f"--preset {preset}: no such preset; choose one of {', '.join(PRESETS)}")
     logger.info("reading %s", checkpoint)
     try:
         digest = file_sha256(checkpoint)

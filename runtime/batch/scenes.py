@@ -3,7 +3,6 @@
 import csv
 import io
 import json
-import math
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -18,6 +17,7 @@ from ..cameras.formats import ESTIMATE, CameraFormat
 from ..errors import InputError, error_context, raise_input_error
 from ..images.sizes import parse_size
 from ..inference.inputs import parse_views
+from ..reconstruction.bounds import check_depth_bounds, check_max_gaussians
 from ..reconstruction.quality import Quality, parse_refine
 from ..splats.filtering import FilterOptions
 from ..system.files import open_regular, without_case
@@ -157,13 +157,8 @@ def check_options(options: Mapping[str, Any]) -> None:
     split_filters(given)
     parse_offset(given.get("offset", AUTO))
     parse_refine(given.get("refine", "0"))
-    if given.get("max_gaussians", 0) < 0:
-        raise InputError(f"max_gaussians {given['max_gaussians']}: expected a number of Gaussians, or 0 for all")
-    for name in ("near", "far"):
-        if name in given and not 0 < given[name] < math.inf:
-            raise InputError(f"{name} {given[name]:g}: expected a positive depth in scene units")
-    if given.get("near", 0) >= given.get("far", math.inf):
-        raise InputError(f"near {given['near']:g} and far {given['far']:g}: expected near < far")
+    check_max_gaussians(given.get("max_gaussians", 0), "max_gaussians")
+    check_depth_bounds(given.get("near"), given.get("far"), prefix="")
 
 
 def _read(place: Place) -> Iterator[Scene]:

@@ -18,8 +18,7 @@ from .terminal import HELP_OPTIONS, run, say
 if TYPE_CHECKING:
     from ..cameras.camera import Camera
 
-TRANSFORMS = "transforms.json"
-OUT_HELP = f"JSON to write: our own, or nerfstudio's layout if it is called {TRANSFORMS}."
+OUT_HELP = "JSON to write: our own, or nerfstudio's layout if it is called transforms.json."
 
 app = typer.Typer(
     add_completion=False,
@@ -83,6 +82,7 @@ def convert(
 
     --images are needed where the format does not name the images, or does not tell their size.
     """
+    from ..cameras.formats.transforms import FILE_NAME
     from ..cameras.io import detect_format, read_cameras, write_cameras
     from ..images.finding import find_images
     from .input_files import camera_files, given_images
@@ -95,8 +95,8 @@ def convert(
     found = read_cameras(cameras, find_images(given) if given else (), camera_format)
     write_cameras(out, found)
     ranges = sum(camera.depth_range is not None for camera in found)
-    if ranges and out.name == TRANSFORMS:
-        note(f"note: a {TRANSFORMS} does not hold depth ranges; those of {ranges} cameras were left out")
+    if ranges and out.name == FILE_NAME:
+        note(f"note: a {FILE_NAME} does not hold depth ranges; those of {ranges} cameras were left out")
     note(f"read {len(found)} cameras as {camera_format or detect_format(cameras)}: {_lenses(found)}")
     say(f"wrote {out}")
 

@@ -174,10 +174,8 @@ def infer(
         close_holes=close_holes,
     )
     files = read_model(model)
-    targets.check_model(files, filters)
+    targets.check_model(files, filters, refine, max_gaussians)
     surface = is_mesh(targets.out)
-    if surface or not files.metadata.gaussians:
-        _refuse_refinement(targets.out, refine, max_gaussians)
     with StopOnInterrupt() as on_step:
         result = reconstruct(
             given,
@@ -224,13 +222,6 @@ def _find_cameras(images: list[Path], cameras: str | None) -> "Found":
     if cameras is None:
         return find_cameras(images)
     return Found(images, None if cameras == ESTIMATE else Path(cameras), "")
-
-
-def _refuse_refinement(out: Path, refine: str | None, max_gaussians: int) -> None:
-    """Raise InputError for options of Gaussians where the output has none."""
-    for option, asked in {"--refine": refine not in (None, "0"), "--max-gaussians": max_gaussians}.items():
-        if asked:
-            raise InputError(f"{option}: changes Gaussians, and {out} is made from depth; leave it out")
 
 
 def _named_after(images: list[Path]) -> Path:

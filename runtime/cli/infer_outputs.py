@@ -65,7 +65,7 @@ class Targets:
             if folder is not None:
                 run.writes_into(option, folder)
 
-    def check_model(self, model: ModelFiles, filters: FilterOptions) -> None:
+    def check_model(self, model: ModelFiles, filters: FilterOptions, refine: str | None, max_gaussians: int) -> None:
         """Raise InputError, before the work, if the model cannot produce a requested output.
 
         For a model that predicts depth alone, .ply and .glb are written as points.
@@ -84,6 +84,9 @@ class Targets:
             )
         if self.depth_format is not None and self.save_depth is None and gaussians:
             raise InputError(f"--depth-format {self.depth_format}: give --save-depth, the folder to write to")
+        asked = ["--refine"] * (refine not in (None, "0")) + ["--max-gaussians"] * bool(max_gaussians)
+        if asked and (surface or not gaussians):
+            raise InputError(f"{asked[0]}: changes Gaussians, and {self.out} is made from depth; leave it out")
         if not gaussians and self.save_depth is None:  # depth maps are such a model's main output
             self.save_depth = self._beside(DEPTH_FOLDER)
 

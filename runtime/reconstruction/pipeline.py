@@ -10,7 +10,6 @@ import numpy as np
 
 from ..cameras.camera import Camera
 from ..cameras.formats import CameraFormat
-from ..errors import InputError
 from ..inference.inputs import Inputs, Request, read_inputs
 from ..inference.model_files import ModelFiles, read_model
 from ..inference.named_models import find_model
@@ -22,6 +21,7 @@ from ..system.progress import CALLBACK, ProgressCallback, reporting_to, working
 from ..views.exposure import compensate_exposure
 from ..views.exposure_mode import ExposureMode, parse_exposure_mode
 from ..views.world_offset import apply_offset, parse_offset
+from .bounds import check_depth_bounds
 from .many_views import predict_views
 from .quality import Quality
 from .result import Reconstruction
@@ -83,7 +83,7 @@ def reconstruct(
     progress: receives reports of progress, see `Progress` in `idesplat.runtime.system.progress`.
     Raises InputError for invalid or unreadable inputs.
     """
-    _check_depth_bounds(near, far)
+    check_depth_bounds(near, far)
     candidates(provider)
     parse_offset(offset or "auto")
     mode = parse_exposure_mode(exposure)
@@ -151,12 +151,3 @@ def _files_of(model: Path | str | ModelFiles | Predictor | None) -> ModelFiles:
     if isinstance(model, Predictor):
         return model.model
     return model if isinstance(model, ModelFiles) else read_model(find_model(model))
-
-
-def _check_depth_bounds(near: float | None, far: float | None) -> None:
-    """Check near and far before any image is read; raises InputError."""
-    for name, value in (("--near", near), ("--far", far)):
-        if value is not None and not 0 < value < float("inf"):
-            raise InputError(f"{name} {value:g}: expected a positive depth in scene units")
-    if near is not None and far is not None and near >= far:
-        raise InputError(f"--near {near:g} and --far {far:g}: expected near < far")

@@ -17,6 +17,7 @@ from ..splats.gaussians import Gaussians
 from ..views.batch import ViewBatch
 from ..views.depth_range import DepthRange
 from ..views.exposure import Exposure
+from .bounds import check_max_gaussians
 from .many_views import voting_views
 from .quality import PRESETS, Preset, Quality, RefinementLimit, default_quality, parse_refine
 from .stereo import correct_depths
@@ -77,8 +78,7 @@ def make_plan(
     """
     if quality is not None and quality not in list(Quality):
         raise InputError(f"--quality {quality}: expected one of {', '.join(Quality)}")
-    if max_gaussians < 0:
-        raise InputError(f"--max-gaussians {max_gaussians}: expected a number of Gaussians, or 0 for all")
+    check_max_gaussians(max_gaussians)
     preset = PRESETS[Quality(quality or default_quality(model.path))]
     if preset.fuse and model.metadata.gaussians:
         filters = replace(filters, remove_contradicted=True, remove_redundant=True, close_holes=True)

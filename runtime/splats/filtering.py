@@ -81,8 +81,7 @@ def filter_gaussians(
     gaussians: one for each pixel, ordered by view, row, column. depth: z-depth, [views, height, width]. extrinsics:
     camera-to-world, OpenCV axes, [views, 4, 4]. intrinsics: normalised by width and height, [views, 3, 3]. voters: the
     views that may contradict each view, as arrays of indices; by default all others. `min_consistency` asks all.
-    images: RGB in [0, 1],
-    [views, 3, height, width], for votes by colour.
+    images: RGB in [0, 1], [views, 3, height, width], for votes by colour.
     Raises InputError if a border is wider than the images, or no Gaussian is left.
     """
     means = gaussians.means.reshape(*depth.shape, 3)

@@ -94,8 +94,9 @@ def spawn_workers(size: int, work: Callable[..., None], *arguments: Any) -> Iter
         try:
             yield
         except ProcessEnded:
-            for error in sorted(folder.glob(ERROR_FILES)):
-                raise InputError(error.read_text(encoding="utf-8")) from None
+            messages = [path.read_text(encoding="utf-8") for path in sorted(folder.glob(ERROR_FILES))]
+            if messages:
+                raise InputError(messages[0]) from None
             raise
         finally:
             dist.destroy_process_group()

@@ -20,12 +20,10 @@ import typer
 from safetensors.torch import save_file
 from torch import Tensor
 
+from ...export.conversion import load
 from ...export.pipeline import export_checkpoint
 from ...export.targets import WEB
-from ...model.checkpoint import CheckpointError, load_checkpoint
-from ...model.registry import PRESETS
 from ...runtime.cli.terminal import run
-from ...runtime.errors import InputError
 from ...runtime.inference.bundled_model import CHECKSUM_SUFFIX, FOLDER, NAME
 from ...runtime.system.files import atomic_write, make_folder, scratch_folder
 
@@ -40,12 +38,7 @@ def release_bundled_model(
     preset: Annotated[str, typer.Option(help="The network.")] = PRESET,
 ) -> None:
     """Export the mean of the checkpoints' weights as the bundled model."""
-    if preset not in PRESETS:
-        raise InputError(f"--preset {preset}: no such preset; choose one of {', '.join(PRESETS)}")
-    try:
-        weights = mean_weights([load_checkpoint(checkpoint, preset).state_dict() for checkpoint in checkpoints])
-    except CheckpointError as error:
-        raise InputError(str(error)) from None
+    weights = mean_weights([load(checkpoint, preset).model.state_dict() for checkpoint in checkpoints])
     path = make_folder(FOLDER) / NAME
     with scratch_folder() as folder:
         save_file(weights, folder / WEIGHTS.name)

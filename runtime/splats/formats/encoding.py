@@ -2,14 +2,13 @@
 
 import numpy as np
 
+# Of a limit: values that were read from a file lie up to float32's rounding beyond it.
+LEAST_CHANGE = 1e-6
+
 
 def round_to_uint8(values: np.ndarray) -> np.ndarray:
     """The nearest integers from 0 to 255, uint8."""
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
-
-
-# Of a limit: values that were read from a file lie up to float32's rounding beyond it.
-LEAST_CHANGE = 1e-6
 
 
 def clipped_note(name: str, values: np.ndarray, low: float, high: float) -> list[str]:

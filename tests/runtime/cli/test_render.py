@@ -206,6 +206,13 @@ def a_ball_of_gaussians(centre: tuple[float, float, float] = (1, -2, 5), count: 
     )
 
 
+@pytest.fixture
+def ball_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """scene.ply with a ball of Gaussians, in the folder in which the test stands."""
+    monkeypatch.chdir(tmp_path)
+    write_ply(Path("scene.ply"), a_ball_of_gaussians())
+
+
 def read_video(path: Path) -> tuple[np.ndarray, float]:
     """All frames as RGB, [frames, height, width, 3], and how many a second."""
     with av.open(str(path)) as container:
@@ -295,11 +302,10 @@ def test_a_still_without_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert {path.name for path in tmp_path.iterdir()} == {"scene.ply", "still.png"}
 
 
+@pytest.mark.usefixtures("ball_file")
 def test_capital_endings_are_written_in_small_letters(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    write_ply(Path("scene.ply"), a_ball_of_gaussians())
     assert run(monkeypatch, "scene.ply", "--out", "Shot.PNG", "--size", "32x48") == 0
     assert "Shot.PNG" not in capsys.readouterr().out
     assert Path("Shot.png").is_file()
@@ -342,11 +348,8 @@ def test_an_orbit_as_a_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ca
     assert "orbit-depth.mp4" in capsys.readouterr().out
 
 
-def test_many_images_are_reported_in_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    write_ply(Path("scene.ply"), a_ball_of_gaussians())
+@pytest.mark.usefixtures("ball_file")
+def test_many_images_are_reported_in_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     assert run(monkeypatch, "scene.ply", "--orbit", "--frames", 9, "--depth", "--size", "24x32", "--out", "out") == 0
     wrote, last = capsys.readouterr().out.splitlines()
     assert wrote == "wrote 27 files in out" and last.endswith("rendered in 9 images; open out in any image viewer")
@@ -368,6 +371,7 @@ def test_a_path_through_the_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         assert psnr(read_rgb(tmp_path / "out" / f"frame-{index:04d}.png"), expected) > 45
 
 
+@pytest.mark.usefixtures("ball_file")
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -403,8 +407,6 @@ def test_a_path_through_the_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_requests_that_make_no_image(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, options: tuple, message: str
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    write_ply(Path("scene.ply"), a_ball_of_gaussians())
     cameras = [Camera(f"{size}", size, 30, pinhole(size, 30), pose((0, 0, 0), (1, -2, 0))) for size in (20, 30)]
     write_cameras(Path("cameras.json"), cameras)
     assert run(monkeypatch, "scene.ply", *options) == 2
@@ -438,11 +440,8 @@ def test_a_lens_blurs_what_is_out_of_focus(
     assert "in focus" not in capsys.readouterr().out
 
 
-def test_an_aperture_of_zero_is_the_pinhole(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    write_ply(Path("scene.ply"), a_ball_of_gaussians())
+@pytest.mark.usefixtures("ball_file")
+def test_an_aperture_of_zero_is_the_pinhole(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     assert run(monkeypatch, "scene.ply", "--size", "24x32", "--out", "pinhole.png") == 0
     for number, options in enumerate(((), ("--focus", "auto"), ("--focus", "2"))):
         assert (
@@ -452,11 +451,8 @@ def test_an_aperture_of_zero_is_the_pinhole(
     assert "in focus" not in capsys.readouterr().out
 
 
-def test_a_lens_with_nothing_to_focus_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    write_ply(Path("scene.ply"), a_ball_of_gaussians())
+@pytest.mark.usefixtures("ball_file")
+def test_a_lens_with_nothing_to_focus_on(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     write_cameras(Path("cameras.json"), [Camera("away", 40, 30, pinhole(40, 30), pose((0, 3, 0), (1, -2, 0)))])
     arguments = ("scene.ply", "--cameras", "cameras.json", "--aperture", "0.5", "--out", "out")
     assert run(monkeypatch, *arguments) == 2
@@ -512,22 +508,18 @@ def test_a_video_is_what_browsers_play(tmp_path: Path) -> None:
     np.testing.assert_array_equal(frames[0][33, :64] // 8, frames[0][32, :64] // 8)  # padded with what is beside
 
 
-def test_a_video_without_its_library(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
+@pytest.mark.usefixtures("ball_file")
+def test_a_video_without_its_library(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     monkeypatch.setattr(video_out, "find_spec", lambda name: None)
-    monkeypatch.chdir(tmp_path)
-    write_ply(Path("scene.ply"), a_ball_of_gaussians())
     assert run(monkeypatch, "scene.ply", "--orbit", "--out", "a.mp4") == 2
     assert "pip install 'idesplat[video]'" in capsys.readouterr().err
     assert not Path("a.mp4").exists()
 
 
+@pytest.mark.usefixtures("ball_file")
 def test_folders_are_made_and_left_only_with_what_they_are_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    write_ply(Path("scene.ply"), a_ball_of_gaussians())
     assert run(monkeypatch, "scene.ply", "--size", "24x32", "--out", "new/folder/a.png") == 0
     assert run(monkeypatch, "scene.ply", "--size", "24x32", "--frames", 2, "--orbit", "--out", "new/one/a.mp4") == 0
     assert {path.name for path in Path("new").rglob("*.*")} == {"a.png", "a.mp4"}

@@ -10,6 +10,7 @@ from idesplat.runtime.splats.axes import GLTF, OPENGL, convert_axes
 from idesplat.runtime.splats.formats import codebooks
 from idesplat.runtime.splats.formats.codebooks import build_codebook, cluster_vectors, quantize
 from idesplat.runtime.splats.formats.compressed_ply import CHUNK
+from idesplat.runtime.splats.formats.encoding import clipped_note
 from idesplat.runtime.splats.formats.morton import morton_order
 from idesplat.runtime.splats.gaussians import Gaussians
 from idesplat.runtime.splats.io import read_splats, write_splats
@@ -109,3 +110,12 @@ def test_clustering_assigns_the_nearest_centroid(monkeypatch: pytest.MonkeyPatch
     assert np.square(distances.min(axis=1)).mean() < min(np.square(off).mean() for off in by_chance)
     again, _ = cluster_vectors(vectors)
     np.testing.assert_array_equal(again, learned)
+
+
+def test_values_at_a_limit_are_not_clipped() -> None:
+    low, high = np.exp(-10.0), np.exp(5.9375)
+    at_limits = np.float32([low, high])
+    assert clipped_note("scales", np.nextafter(at_limits, np.float32([0, 1e9])), low, high) == []
+    assert clipped_note("scales", 1.001 * at_limits, low, high) == [
+        f"1 of 2 scales outside {low:.3g} to {high:.3g} were clipped"
+    ]

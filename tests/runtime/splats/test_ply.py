@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.splats.formats.ply import read_ply, write_ply
 from idesplat.runtime.splats.gaussians import Gaussians
+from idesplat.runtime.splats.io import read_offset
 from plyfile import PlyData, PlyElement
 
 ARRAYS = ("means", "scales", "quats", "opacities", "sh")
@@ -272,3 +273,12 @@ def test_any_mutation_gives_a_scene_or_an_input_error(tmp_path: Path, splat_byte
             return
     for name in ARRAYS:
         assert np.isfinite(getattr(gaussians, name)).all()
+
+
+def test_an_offset_behind_a_blank_line_of_the_header_is_read(tmp_path: Path) -> None:
+    write_ply(tmp_path / "a.ply", some_gaussians(0, 0))
+    content = (tmp_path / "a.ply").read_bytes()
+    start, rest = content.split(b"\n", 1)
+    (tmp_path / "b.ply").write_bytes(start + b"\n\ncomment offset 1 2 3\n" + rest)
+    assert len(read_ply(tmp_path / "b.ply")) == 0
+    np.testing.assert_array_equal(read_offset(tmp_path / "b.ply"), [1, 2, 3])

@@ -7,6 +7,7 @@ import trimesh
 from idesplat.export.example_inputs import example_inputs
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.splats.gaussians import Gaussians
+from idesplat.runtime.splats.io import write_splats
 from idesplat.runtime.splats.mesh import faces_from_depth
 from idesplat.runtime.splats.points import (
     MESH_SUFFIXES,
@@ -124,3 +125,10 @@ def test_ply_is_what_every_viewer_reads(views, tmp_path):
 def test_a_folder_that_is_not_there_is_one_line(views, tmp_path):
     with pytest.raises(InputError, match="cannot write"):
         write_point_cloud(tmp_path / "nowhere" / "scene.ply", points_from_depth(*views))
+
+
+def test_points_without_any_are_refused_by_glb(tmp_path):
+    none = Gaussians(*(np.zeros((0, *shape), np.float32) for shape in ((3,), (3,), (4,), (), (1, 3))))
+    with pytest.raises(InputError, match=r"cannot write .*a\.points\.glb: there are no points"):
+        write_splats(tmp_path / "a.points.glb", none)
+    assert not list(tmp_path.iterdir())
