@@ -24,7 +24,7 @@ for (const [name, shape] of Object.entries(shapes)) {
 }
 
 const session = await ort.InferenceSession.create(new Uint8Array(await readFile(model)), {
-  executionProviders: ["wasm"], // in a browser also "webgpu"
+  executionProviders: ["wasm"], // in a browser also "webgpu", for graphs exported with --target web
 });
 const outputs = await session.run(inputs);
 for (const [name, { data, dims }] of Object.entries(outputs)) {

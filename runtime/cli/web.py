@@ -1,5 +1,6 @@
 """The command `idesplat web`: a page that reconstructs in the browser, as a folder for any static host."""
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -41,7 +42,9 @@ def web(
     if serve:
         _serve(folder, port)
     else:
-        say(f"put the folder on any static host, or look at it here: idesplat web {folder} --serve")
+        chosen = [*(["--model", str(model)] if model else []), *(["--size", size] if size else [])]
+        again = shlex.join(["idesplat", "web", str(folder), *chosen, "--serve"])
+        say(f"put the folder on any static host, or look at it here: {again}")
 
 
 def _serve(folder: Path, port: int) -> None:

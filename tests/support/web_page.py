@@ -33,9 +33,9 @@ class StaticHost(PageHandler):
 
 
 @contextmanager
-def serving(folder: Path):
-    """The address of a static host of the folder, and its server."""
-    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(StaticHost, directory=str(folder)))
+def serving(folder: Path, host: type[SimpleHTTPRequestHandler] = StaticHost):
+    """The address of a host of the folder, and its server."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(host, directory=str(folder)))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     try:
         yield f"http://127.0.0.1:{server.server_address[1]}/", server

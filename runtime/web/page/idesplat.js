@@ -17,9 +17,14 @@ export { InputError, parseColmap, toPly, toSpz };
 export function reconstruct(files, cameras, options = {}) {
   const { provider = null, near, far, focal, onProgress = () => {}, signal } = options;
   if (signal?.aborted) return Promise.reject(new InputError(STOPPED)); // its event does not come again
-  const worker = new Worker(new URL("./worker.js", import.meta.url), { type: "module" });
+  // A worker from a blob has the page's content security policy; one from a file has that of the file's response.
+  const source = `import ${JSON.stringify(new URL("./worker.js", import.meta.url).href)};`;
+  const url = URL.createObjectURL(new Blob([source], { type: "text/javascript" }));
+  const worker = new Worker(url, { type: "module" });
   const done = new Promise((resolve, reject) => {
-    worker.onerror = (event) => reject(new InputError(`the worker failed (${event.message}); reload the page`));
+    // Without a message: its files could not be loaded.
+    const reason = (event) => event.message ?? "its files cannot be loaded";
+    worker.onerror = (event) => reject(new InputError(`the worker failed (${reason(event)}); reload the page`));
     worker.onmessage = ({ data }) => {
       if (data.kind === "progress") onProgress({ stage: data.stage, share: data.share });
       else if (data.kind === "error") reject(new InputError(data.message));
@@ -28,5 +33,9 @@ export function reconstruct(files, cameras, options = {}) {
     signal?.addEventListener("abort", () => reject(new InputError(STOPPED)));
   });
   worker.postMessage({ files: [...files], cameras, options: { provider, near, far, focal } });
-  return /** @type {any} */ (done.finally(() => worker.terminate()));
+  const end = () => {
+    worker.terminate();
+    URL.revokeObjectURL(url);
+  };
+  return /** @type {any} */ (done.finally(end));
 }

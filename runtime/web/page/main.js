@@ -16,8 +16,8 @@ const state = { images: [], cameraFiles: [], stop: null, running: false, viewer:
 async function prepare() {
   if (!("serviceWorker" in navigator)) return;
   try {
-    await navigator.serviceWorker.register("service-worker.js");
-    await navigator.serviceWorker.ready;
+    const registration = await navigator.serviceWorker.register("service-worker.js");
+    await Promise.race([navigator.serviceWorker.ready, installationFailed(registration)]);
   } catch (error) {
     console.warn("without a service worker the page needs the network, and has one thread:", error);
     return;
@@ -27,6 +27,15 @@ async function prepare() {
     sessionStorage.setItem(RELOADED, "yes");
     location.reload();
   }
+}
+
+/** Rejects where the service worker cannot be installed: `ready` then waits for ever. */
+function installationFailed({ installing }) {
+  return new Promise((_, reject) => {
+    installing?.addEventListener("statechange", () => {
+      if (installing.state === "redundant") reject(new Error("a file could not be loaded or kept"));
+    });
+  });
 }
 
 async function describeEnvironment() {

@@ -3,6 +3,7 @@
 import base64
 import io
 import json
+import shlex
 import struct
 import threading
 import zlib
@@ -162,6 +163,13 @@ def canvas(page) -> np.ndarray:
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
     return float(-10 * np.log10(np.mean((a - b) ** 2)))
+
+
+def test_the_printed_command_makes_the_same_page(exported, tmp_path, capsys):
+    chosen = ("--model", str(exported[0]), "--size", SIZE)
+    assert run_command(web, tmp_path / "my page", *chosen) == 0
+    printed = capsys.readouterr().out.partition("here: ")[2]
+    assert shlex.split(printed) == ["idesplat", "web", str(tmp_path / "my page"), *chosen, "--serve"]
 
 
 def test_webgpu_is_refused_for_a_graph_that_was_not_exported_for_it(browser, site, captured):

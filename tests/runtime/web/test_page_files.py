@@ -1,4 +1,5 @@
-"""The files of the page in headless Chromium: those that its user chooses, and those that its service worker keeps.
+"""The files of the page in headless Chromium: those that its user chooses, those that its service worker keeps, and
+those that its worker may fetch.
 
 A reconstruction that the test ends takes the place of the real one.
 """
@@ -6,8 +7,10 @@ A reconstruction that the test ends takes the place of the real one.
 import shutil
 from http.server import SimpleHTTPRequestHandler
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
+from idesplat.runtime.web.serving import PageHandler
 from idesplat.runtime.web.site import FILES_MARK, PAGE
 from web_page import DROP, StaticHost, serving
 
@@ -33,6 +36,14 @@ URL.revokeObjectURL = (url) => { urls.delete(url); revokeObjectURL(url); };
 UNREADABLE = (
     "DataTransferItem.prototype.webkitGetAsEntry = () => ({ isFile: true, file: (_, no) => no(new Error('gone')) })"
 )
+# In place of the worker: sends what it was given to another host.
+UPLOADING = """self.onmessage = async ({ data }) => {
+  const sent = await fetch(data.cameras, { method: "POST", body: "photograph" }).then(() => "sent", () => "refused");
+  self.postMessage({ kind: "error", message: sent });
+};"""
+# What a reconstruction with the page's own module is answered.
+ANSWER = """(cameras) => import("./idesplat.js").then(({ reconstruct }) => reconstruct([], cameras)).catch(
+  (error) => error.message)"""
 # The state in which the installation of the service worker ends.
 INSTALL = """async () => {
   const { installing } = await navigator.serviceWorker.register("service-worker.js");
@@ -41,6 +52,21 @@ INSTALL = """async () => {
   }
   return installing.state;
 }"""
+
+
+class OpenHost(StaticHost):
+    """A host that takes uploads from everywhere."""
+
+    received: ClassVar[list[str]] = []
+
+    def end_headers(self) -> None:
+        self.send_header("Access-Control-Allow-Origin", "*")
+        super().end_headers()
+
+    def do_POST(self) -> None:
+        self.received.append(self.path)
+        self.send_response(200)
+        self.end_headers()
 
 
 @pytest.fixture(scope="module")
@@ -151,3 +177,42 @@ def test_the_service_worker_asks_whether_files_are_current(browser, tmp_path: Pa
         assert page.evaluate("fetch('late.txt').then((response) => response.text())") == "1"
     page.close()
     assert (asked["/kept.js"], asked["/late.txt"]) == ("max-age=0", "max-age=0")
+
+
+def test_a_failed_installation_of_the_service_worker_is_told(browser, tmp_path: Path) -> None:
+    shutil.copytree(PAGE, tmp_path / "page")
+    text = (PAGE / "service-worker.js").read_text()
+    (tmp_path / "page" / "service-worker.js").write_text(text.replace(FILES_MARK, 'FILES = ["missing.js"]'))
+    page = browser.new_page()
+    with (
+        serving(tmp_path / "page") as (address, _),
+        page.expect_console_message(lambda said: said.text.startswith("without a service worker")),
+    ):
+        page.goto(address)
+    page.close()
+
+
+@pytest.mark.parametrize("isolated", [True, False])
+def test_the_worker_reaches_no_other_host(browser, tmp_path: Path, monkeypatch, isolated: bool) -> None:
+    """Neither on a host that isolates the page nor on another; the host that is asked would allow it."""
+    monkeypatch.setattr(OpenHost, "received", [])
+    shutil.copytree(PAGE, tmp_path / "page")
+    (tmp_path / "page" / "worker.js").write_text(UPLOADING)
+    page = browser.new_context(service_workers="block").new_page()
+    host = PageHandler if isolated else StaticHost
+    with serving(tmp_path / "page", host) as (address, _), serving(tmp_path, OpenHost) as (other, _):
+        page.goto(address)
+        assert page.evaluate("crossOriginIsolated") == isolated
+        assert page.evaluate(ANSWER, other) == "refused"
+    page.context.close()
+    assert OpenHost.received == []
+
+
+def test_a_worker_whose_files_are_missing_is_told(browser, tmp_path: Path) -> None:
+    shutil.copytree(PAGE, tmp_path / "page")
+    (tmp_path / "page" / "worker.js").unlink()
+    page = browser.new_context(service_workers="block").new_page()
+    with serving(tmp_path / "page") as (address, _):
+        page.goto(address)
+        assert page.evaluate(ANSWER, None) == "the worker failed (its files cannot be loaded); reload the page"
+    page.context.close()
