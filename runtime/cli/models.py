@@ -60,7 +60,7 @@ def _bundled() -> dict[str, Any]:
         "size": [own.height, own.width],
         "views": own.trained_views,
         "gaussians": own.gaussians,
-        "licence": "MIT",
+        "licence": "MIT AND Apache-2.0",
         "state": BUNDLED_STATE,
         "path": str(path),
     }
