@@ -31,7 +31,7 @@ ORDERS = {
         *("existing_exports", "targets", "graph", "stages", "example_inputs", "precision", "tracing", "validation"),
         *("conversion", "calibration_images", "hub", "triton", "pipeline", "released", "cli"),
     ),
-    "tools": ("processes", "synthetic", "training", "evaluation", "benchmark", "figures"),
+    "tools": ("processes", "imagenet", "perceptual", "synthetic", "evaluation", "training", "benchmark", "figures"),
 }
 
 # Modules that import others of ours inside functions: commands, for their start-up time, and these.

@@ -10,7 +10,7 @@ import numpy as np
 from ...runtime.errors import InputError
 
 if TYPE_CHECKING:
-    from ..training.perceptual import Perceptual
+    from ..perceptual import Perceptual
 
 # SSIM as Wang et al. (2004) define it and the releases compute it with scikit-image.
 SSIM_WINDOW = 11
@@ -84,7 +84,7 @@ def load_lpips() -> PerceptualMetric:
     Raises InputError if torch, lpips or VGG16's weights are missing.
     """
     _check_torch("LPIPS")
-    from ..training import perceptual
+    from .. import perceptual
 
     return _as_metric(perceptual.load_lpips())
 
@@ -95,7 +95,7 @@ def load_lite0() -> PerceptualMetric:
     Invalid pixels are given the truth's colour. Raises InputError if torch or the network's weights are missing.
     """
     _check_torch(LITE0_TITLE)
-    from ..training import perceptual
+    from .. import perceptual
 
     try:
         return _as_metric(perceptual.EfficientNetDistance())

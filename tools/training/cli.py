@@ -14,12 +14,23 @@ from ...runtime.cli.terminal import run, say, warn
 from ...runtime.errors import InputError
 from ...runtime.images.sizes import parse_size
 from ...runtime.system.outputs import outputs
-from .options import Device, Objective, Part, PerceptualKind, Precision, Resources
+from .options import (
+    INPUT_VIEWS,
+    TARGET_ZOOM,
+    Device,
+    Objective,
+    Part,
+    PerceptualKind,
+    Precision,
+    Resources,
+)
 from .run_files import CHECKPOINT, CURVES, LOG, PREDICTIONS
 
 SECONDS_PER_MINUTE = 60
 MIN_SIDE = 64
 MAX_SEED = 2**63 - 1
+# Captures are resized to so many times the size of the context images, which takes memory.
+MAX_TARGET_ZOOM = 8
 # What the progress bar shows of a step, by its name in the log.
 SHOWN = {"loss": "loss", "abs_rel": "AbsRel", "psnr": "PSNR"}
 
@@ -75,6 +86,24 @@ def train(
         PerceptualKind,
         typer.Option(help="Perceptual distance of rendered views: LPIPS (if installed), EfficientNet-Lite0, or none."),
     ] = PerceptualKind.LPIPS,
+    target_zoom: Annotated[
+        int,
+        typer.Option(
+            help="One target view is a crop of an image from 2 to so many times as large as the input images, one has "
+            "their size; 1: both have it.",
+            min=1,
+            max=MAX_TARGET_ZOOM,
+        ),
+    ] = TARGET_ZOOM,
+    input_views: Annotated[
+        int | None,
+        typer.Option(
+            help="Input views that are rendered beside the novel ones; 0: novel views alone. By default "
+            f"{INPUT_VIEWS[Part.ALL]}, with --train head {INPUT_VIEWS[Part.HEAD]}.",
+            min=0,
+            show_default=False,
+        ),
+    ] = None,
     pm_loss: Annotated[
         float, typer.Option(help="Weight of PM-Loss against true points or --pointmaps; 0.005 in the paper.", min=0)
     ] = 0.0,
@@ -112,6 +141,13 @@ def train(
     ] = 0,
     save_every: Annotated[float, typer.Option(help="Minutes between checkpoints.", min=0)] = 3.0,
     validate_every: Annotated[int, typer.Option(help="Steps between validations.", min=1)] = 200,
+    validate_captures: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of checkouts as of idesplat eval captures. Every validation then renders a held-out image of "
+            "each capture in it, too, and logs their mean PSNR."
+        ),
+    ] = None,
     overwrite: Overwrite = False,
     config_file: Config = None,
     verbose: Verbose = 0,
@@ -144,12 +180,15 @@ def train(
         consistency=consistency,
         aperture=aperture,
         photo_lr=photo_lr,
+        target_zoom=target_zoom,
+        # The part's own number is no other setting than none.
+        input_views=None if input_views == INPUT_VIEWS[part] else input_views,
     )
     config = network_config(settings)
     _announce(out, init, data or [])
     outputs().make_folder(out)
 
-    from .perceptual import check_lpips
+    from ..perceptual import check_lpips
     from .trainer import train as train_network
 
     def warn_without_lpips() -> None:
@@ -168,6 +207,7 @@ def train(
             resources=Resources(processes, threads, device, together, loaders),
             save_every=save_every * SECONDS_PER_MINUTE,
             validate_every=validate_every,
+            captures=validate_captures,
             on_start=warn_without_lpips,
             on_step=on_step,
         )

@@ -17,11 +17,12 @@ from ...model.common.geometry import Cameras
 from ...model.idesplat.gaussian_head import HeadInputs
 from ...model.idesplat.network import IDESplat
 from ...runtime.system.files import atomic_write, make_folder
+from ..perceptual import Perceptual
 from ..synthetic.sampler import TRAINING_SEEDS
 from .data.samples import SampleSpec, TrainingViews
-from .data.synthetic import MAX_TARGET_ZOOM, sample_view_count
+from .data.synthetic import sample_target_zooms, sample_view_count
 from .losses import offset_prior, photometric_loss
-from .perceptual import Perceptual
+from .options import INPUT_VIEWS, TARGET_ZOOM, Part
 from .step import PHOTOMETRIC_WEIGHT, psnr, render_targets, with_input_views
 
 # The trained parts of the network: the Gaussian focused module with its input convolutions, and the head.
@@ -29,8 +30,6 @@ HEAD_PARTS = ("conv_image", "fuse", "focus", "expand", "head1", "head2", "cross_
 HEAD_PREFIXES = tuple(f"gaussians.{part}." for part in HEAD_PARTS)
 # Numbers of context views, and their probabilities.
 VIEW_COUNT_PROBABILITIES = {2: 0.75, 3: 0.12, 4: 0.08, 6: 0.05}
-# Context views that are rendered beside the two target views.
-INPUT_VIEWS = 2
 # If the mean opacity is above the first value, the sigmoid is saturated and has no gradient. The mean is then reset to
 # the second value, and scales are multiplied by SCALE_GAIN, so that the more transparent Gaussians leave no gaps.
 SATURATED_OPACITY, START_OPACITY = 0.95, 0.5
@@ -90,12 +89,17 @@ def cameras_of(views: TrainingViews) -> Cameras:
     return Cameras(views.extrinsics, views.intrinsics, views.near, views.far)
 
 
-def head_spec(seed: int, index: int, height: int, width: int, real_ratio: float) -> SampleSpec:
-    """Scene number `index` of the set that a run with `seed` repeats. real_ratio: probability of a capture."""
+def head_spec(
+    seed: int, index: int, height: int, width: int, real_ratio: float, target_zoom: int = TARGET_ZOOM
+) -> SampleSpec:
+    """Scene number `index` of the set that a run with `seed` repeats.
+
+    real_ratio: probability of a capture. target_zoom: the largest zoom of a target view.
+    """
     rng = np.random.default_rng((seed, index))
     context = sample_view_count(rng, VIEW_COUNT_PROBABILITIES)
     scene = int(rng.integers(TRAINING_SEEDS.start, TRAINING_SEEDS.stop))
-    target_zooms = (1, int(rng.integers(2, MAX_TARGET_ZOOM + 1)))
+    target_zooms = sample_target_zooms(rng, target_zoom)
     return SampleSpec(scene, context, target_zooms, height, width, real=bool(rng.random() < real_ratio))
 
 
@@ -106,25 +110,30 @@ def scene_index(seed: int, place: int, scenes: int) -> int:
 
 
 def head_loss(
-    model: IDESplat, sample: HeadSample, step: int, perceptual: Perceptual | None
+    model: IDESplat,
+    sample: HeadSample,
+    step: int,
+    perceptual: Perceptual | None,
+    input_views: int = INPUT_VIEWS[Part.HEAD],
 ) -> tuple[Tensor, dict[str, float]]:
     """The loss of a sample, and what is logged.
 
-    Target views and INPUT_VIEWS context views are rendered, from number `step` modulo their count on.
+    Target views and so many context views are rendered, from number `step` modulo their count on.
     """
     views = sample.views
     predicted = model.gaussians.predict(views.images, cameras_of(views), sample.inputs)
-    shown = with_input_views(views, step, INPUT_VIEWS)
+    shown = with_input_views(views, step, input_views)
     rendered = render_targets(predicted.gaussians, shown)
     photometric = photometric_loss(rendered, shown.target_images, perceptual)
     loss = PHOTOMETRIC_WEIGHT * photometric + offset_prior(predicted.raw)
-    novel, of_inputs = rendered.detach().split((len(rendered) - INPUT_VIEWS, INPUT_VIEWS))
+    novel = len(views.target_images)
     entry = {
         "loss": float(loss.detach()),
-        "psnr": psnr(novel, shown.target_images[:-INPUT_VIEWS]),
-        "input_psnr": psnr(of_inputs, shown.target_images[-INPUT_VIEWS:]),
+        "psnr": psnr(rendered[:novel].detach(), views.target_images),
         "opacity": float(predicted.gaussians.opacities.detach().mean()),
     }
+    if input_views:
+        entry["input_psnr"] = psnr(rendered[novel:].detach(), shown.target_images[novel:])
     return loss, entry
 
 

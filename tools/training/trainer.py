@@ -21,7 +21,9 @@ from ...model.idesplat.config import IDESplatConfig
 from ...model.idesplat.gaussian_head import HeadInputs
 from ...model.idesplat.network import IDESplat
 from ...runtime.errors import InputError
+from ..perceptual import EfficientNetDistance, Perceptual, load_lpips
 from ..synthetic.photo_textures import photo_textures
+from .capture_validation import CaptureValidation
 from .convolutions import use_channels_last
 from .data.captures import CaptureScenes
 from .data.samples import SampleSpec, TrainingViews, prefetch, prefetch_in_processes
@@ -32,7 +34,6 @@ from .mixed_precision import with_bfloat16
 from .objectives.consistency import with_matches
 from .options import Device, Objective, Part, PerceptualKind, Precision, Resources
 from .parallel import ProcessGroup, mean_entries, spawn_workers
-from .perceptual import EfficientNetDistance, Perceptual, load_lpips
 from .plots import write_curves
 from .run_files import CHECKPOINT, CURVES, FEATURES, LOG, PREDICTIONS
 from .schedule import Phase, lr_factor, phase_at
@@ -46,7 +47,12 @@ OnStep = Callable[[dict[str, Any]], None]
 Source = Callable[[SampleSpec], TrainingViews]
 
 ONE_THREAD = Resources()
-PLOTTED = ("loss", "psnr", "input_psnr", "abs_rel", "validation_abs_rel", "validation_psnr", "gradient")
+# The name in the log of the mean PSNR of the validation captures.
+CAPTURES_PSNR = "captures_psnr"
+PLOTTED = (
+    *("loss", "psnr", "input_psnr", "abs_rel"),
+    *("validation_abs_rel", "validation_psnr", CAPTURES_PSNR, "gradient"),
+)
 # glibc returns the memory of every large tensor to the system, which clears it again on the next allocation. These
 # parameters of mallopt make it keep that memory.
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
@@ -62,21 +68,23 @@ def train(
     resources: Resources = ONE_THREAD,
     save_every: float = 180.0,
     validate_every: int = 200,
+    captures: Path | None = None,
     on_start: Callable[[], None] | None = None,
     on_step: OnStep | None = None,
 ) -> None:
     """Train a network in the folder `out`, or resume the run whose checkpoint is there.
 
     config: the network's, if not that of the preset. features: folder of cached features, by default one inside `out`.
-    save_every: seconds between checkpoints. validate_every: steps between validations. on_start: called once weights
-    and data are loaded. on_step: called after each step. LPIPS is left out where it is not installed.
+    save_every: seconds between checkpoints. validate_every: steps between validations. captures: folder of checkouts,
+    whose validation captures are rendered at every validation. on_start: called once weights and data are loaded.
+    on_step: called after each step. LPIPS is left out where it is not installed.
 
     Raises InputError for settings that contradict each other, for a checkpoint of another run, and for unusable data.
     """
     config = config or network_config(settings)
     _check_resources(resources, settings, config)
     processes = resources.processes
-    trainer = Trainer(out, settings, config, features, ProcessGroup(0, processes), resources)
+    trainer = Trainer(out, settings, config, features, ProcessGroup(0, processes), resources, captures)
     if on_start is not None:
         on_start()
     with spawn_workers(processes, _work, out, settings, config, features, resources, validate_every):
@@ -107,10 +115,12 @@ class Trainer:
         features: Path | None = None,
         group: ProcessGroup | None = None,
         resources: Resources = ONE_THREAD,
+        captures: Path | None = None,
     ) -> None:
         """Start the run, or resume it from the checkpoint in the folder; raises InputError if that is another run's.
 
         features: folder of cached features, by default one inside `folder`. group: the processes of the run.
+        captures: folder of checkouts of the validation captures that this process renders, too.
         """
         _prepare_process(resources.threads)
         self.folder, self.settings, self.group = folder, settings, group or ProcessGroup()
@@ -122,6 +132,7 @@ class Trainer:
             self.state.resume(folder / CHECKPOINT, asdict(settings))
         elif settings.init:
             self.state.start_from(Path(settings.init))
+        self.captures = CaptureValidation(captures, settings, config) if captures else None
         self.source, self.held_out = _sources(settings, config)
         if settings.consistency:
             self.source = partial(with_matches, self.source)
@@ -200,10 +211,15 @@ class Trainer:
             left -= 1 + others
 
     def validate(self) -> dict[str, Any]:
-        """Metrics of the EMA network on validation scenes at the phase's size; writes their predictions."""
-        phase = self.phase(self.state.step - 1)
+        """Metrics of the EMA network on validation scenes at the phase's size; writes their predictions.
+
+        Validation captures are rendered at the run's size in every phase.
+        """
+        phase, model = self.phase(self.state.step - 1), self.state.ema_model()
         side = self.settings.size // phase.downsample
-        found = validate(self.state.ema_model(), phase, side, self.held_out, self.folder / PREDICTIONS)
+        found = validate(model, phase, side, self.held_out, self.folder / PREDICTIONS)
+        if self.captures is not None:
+            found[CAPTURES_PSNR] = self.captures.mean_psnr(model)
         return {name: finite(value) for name, value in found.items()}
 
     def save(self) -> None:
@@ -238,9 +254,19 @@ def _task(
     size, batch = settings.size, settings.batch
     perceptual = _perceptual(settings, next(model.parameters()).device) if settings.renders else None
     if settings.part == Part.HEAD:
-        description = repr((size, settings.data, settings.textures, settings.precision, HeadInputs._fields))
+        sources = settings.data, settings.textures, settings.target_zoom
+        description = repr((size, *sources, settings.precision, HeadInputs._fields))
         cache = FeatureCache(features, model, source, description)
-        return HeadTask(cache, settings.seed, size, batch, settings.scenes, settings.real_ratio, perceptual)
+        return HeadTask(
+            cache,
+            settings.seed,
+            size,
+            batch,
+            settings.scenes,
+            settings.real_ratio,
+            settings.targets,
+            perceptual,
+        )
     objective = Objective(settings.objective)
     return FullNetworkTask(
         settings.phases,
@@ -249,6 +275,7 @@ def _task(
         size,
         source,
         settings.real_ratio,
+        settings.targets,
         perceptual,
         settings.terms,
         together,

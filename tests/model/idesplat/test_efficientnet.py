@@ -10,8 +10,9 @@ from idesplat.model.idesplat.efficientnet import CHANNELS, STRIDES, EfficientNet
 from idesplat.model.idesplat.network import IDESplat
 from idesplat.model.registry import PRESETS
 from idesplat.runtime.errors import InputError
-from idesplat.tools.training import initialization as initialisation
-from idesplat.tools.training.initialization import load_imagenet_weights, new_model
+from idesplat.tools import imagenet
+from idesplat.tools.imagenet import load_imagenet_weights
+from idesplat.tools.training.initialization import new_model
 from idesplat.tools.training.state import PHOTO_NETWORK_PREFIX, WEIGHT_DECAY, TrainingState
 
 LITE = PRESETS["idesplat-lite"]
@@ -77,6 +78,6 @@ def test_a_learning_rate_of_their_own_trains_the_published_weights() -> None:
 
 
 def test_missing_weights_are_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(initialisation, "WEIGHTS_PACKAGE", "no_such_package_of_weights")
+    monkeypatch.setattr(imagenet, "WEIGHTS_PACKAGE", "no_such_package_of_weights")
     with pytest.raises(InputError, match="install the package no_such_package_of_weights"):
         new_model(LITE, seed=0)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 from idesplat.runtime.errors import InputError
+from idesplat.tools import perceptual
 from idesplat.tools.evaluation import metrics
 from idesplat.tools.evaluation.metrics import depth_measures, load_lite0, load_lpips, psnr, ssim
-from idesplat.tools.training import perceptual
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch import Tensor
 

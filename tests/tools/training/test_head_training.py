@@ -135,15 +135,15 @@ def test_run_trains_the_head_alone_and_resumes(finished: Path, tmp_path: Path) -
     assert not (parts / FEATURES).exists()
 
 
-def test_features_of_each_precision_are_cached_apart(finished: Path, tmp_path: Path) -> None:
+def test_features_of_each_precision_and_zoom_are_cached_apart(finished: Path, tmp_path: Path) -> None:
     folders = set()
-    for precision in ("float32", "bf16"):
-        settings = replace(HEAD, init=str(finished / CHECKPOINT), precision=precision)
-        (tmp_path / precision).mkdir()
-        task = Trainer(tmp_path / precision, settings, SMALL, features=tmp_path / FEATURES).task
+    for name, changes in (("float32", {}), ("bf16", {"precision": "bf16"}), ("closer", {"target_zoom": 2})):
+        settings = replace(HEAD, init=str(finished / CHECKPOINT), **changes)
+        (tmp_path / name).mkdir()
+        task = Trainer(tmp_path / name, settings, SMALL, features=tmp_path / FEATURES).task
         assert isinstance(task, HeadTask)
         folders.add(task.cache.folder)
-    assert len(folders) == 2
+    assert len(folders) == 3
 
 
 def test_head_training_needs_a_checkpoint(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from idesplat.model.registry import PRESETS
 from idesplat.runtime.cameras.camera import Camera
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.views.batch import ViewBatch, build_view_batch
+from idesplat.tools.perceptual import load_lpips
 from idesplat.tools.synthetic.make_scene import make_scene
 from idesplat.tools.training import cli, losses, trainer
 from idesplat.tools.training.data import captures
@@ -33,7 +34,6 @@ from idesplat.tools.training.data.synthetic import generate_views, training_spec
 from idesplat.tools.training.initialization import new_model
 from idesplat.tools.training.log import TrainingLog
 from idesplat.tools.training.options import Device, Objective, Part
-from idesplat.tools.training.perceptual import load_lpips
 from idesplat.tools.training.run_files import CHECKPOINT, CURVES, LOG, PREDICTIONS
 from idesplat.tools.training.schedule import Phase, lr_factor, phase_at, training_phases
 from idesplat.tools.training.settings import TrainingSettings

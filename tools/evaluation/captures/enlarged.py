@@ -16,6 +16,7 @@ import typer
 from rich.table import Table
 
 from ....runtime.cli.terminal import run, say
+from ....runtime.images.sizes import parse_size
 from ....runtime.inference.named_models import find_model
 from ....runtime.inference.predictor import Predictor
 from ....runtime.reconstruction.quality import Quality
@@ -29,7 +30,6 @@ from .capture import Capture, CaptureImages, Triple, read_captures
 from .checkouts import frames_of
 from .scores import CaptureEvaluator
 
-LARGER = (384, 512)  # height and width of landscape frames
 # Share of a pixel that the smaller frame must cover.
 COVERED = 0.999
 COLUMNS = ("larger images", "enlarged", "rendered larger")
@@ -39,8 +39,10 @@ def compare(
     checkouts: Annotated[Path, typer.Option(help="Folder of checkouts; missing ones are cloned into it.")],
     capture: Annotated[list[str] | None, typer.Option(help="Use this capture alone; may be repeated.")] = None,
     model: Annotated[Path | None, typer.Option(help="An exported model; else the bundled one.")] = None,
+    size: Annotated[str, typer.Option(help="HEIGHTxWIDTH of larger landscape frames.")] = "384x512",
 ) -> None:
     """Measure PSNR of held-out frames from two larger images, and from two of the trained size."""
+    larger = parse_size(size)
     predictor = Predictor(find_model(model))
     plan = make_plan(Quality.STANDARD, predictor.model, "0", FilterOptions(), 0)
     evaluator = CaptureEvaluator(predictor, {}, plan)
@@ -50,7 +52,7 @@ def compare(
         table.add_column(heading, justify="right")
     means = []
     for source in read_captures(capture or ()):
-        means.append(_capture_scores(evaluator, source, checkouts))
+        means.append(_capture_scores(evaluator, source, checkouts, larger))
         cells = [f"{value:.2f}" for value in means[-1]]
         table.add_row(source.name, *cells)
         say(f"{source.name}: " + ", ".join(f"{name} {cell} dB" for name, cell in zip(COLUMNS, cells, strict=True)))
@@ -74,11 +76,13 @@ def enlarge(image: np.ndarray, targets: PosedImages, larger: PosedImages) -> tup
     return shown, inside > COVERED
 
 
-def _capture_scores(evaluator: CaptureEvaluator, source: Capture, checkouts: Path) -> np.ndarray:
-    """The mean PSNR of a capture's triples, in the order of COLUMNS."""
+def _capture_scores(
+    evaluator: CaptureEvaluator, source: Capture, checkouts: Path, larger: tuple[int, int]
+) -> np.ndarray:
+    """The mean PSNR of a capture's triples, in the order of COLUMNS. larger: height and width of landscape frames."""
     own = evaluator.predictor.metadata
     camera = source.cameras[source.triples[0].target]
-    size = LARGER if camera.width >= camera.height else LARGER[::-1]
+    size = larger if camera.width >= camera.height else larger[::-1]
     with frames_of(checkouts, source) as folder:
         small, large = CaptureImages(source, folder, (own.height, own.width)), CaptureImages(source, folder, size)
         return np.mean([_triple_scores(evaluator, triple, small, large) for triple in source.triples], axis=0)

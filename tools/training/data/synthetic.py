@@ -9,13 +9,11 @@ import torch
 from ...synthetic.photo_textures import concatenate, photo_textures
 from ...synthetic.sampler import TRAINING_SEEDS, Sample, generate_sample, scene_textures
 from ...synthetic.textures import Textures
+from ..options import TARGET_ZOOM
 from .samples import SampleSpec, TrainingViews
 
 # Numbers of context views once there is more than one DPBU, and their probabilities. Six take 7 GB in training.
 VIEW_COUNT_PROBABILITIES = {2: 0.87, 3: 0.08, 4: 0.05}
-# One target view has the size of the context images; another is a crop of an image up to so many times as large.
-# Gaussians that are only rendered at the context's size leave gaps where a viewer shows them larger.
-MAX_TARGET_ZOOM = 4
 
 
 def sample_view_count(rng: np.random.Generator, probabilities: dict[int, float]) -> int:
@@ -23,19 +21,32 @@ def sample_view_count(rng: np.random.Generator, probabilities: dict[int, float])
     return int(rng.choice(list(probabilities), p=list(probabilities.values())))
 
 
+def sample_target_zooms(rng: np.random.Generator, largest: int) -> tuple[int, int]:
+    """The zooms of the two target views: 1, and a random one from 2 to `largest`, or 1 if that is the largest."""
+    return 1, int(rng.integers(min(2, largest), largest + 1))
+
+
 def training_spec(
-    seed: int, step: int, slot: int, rendered: bool, height: int, width: int, more_views: bool, real_ratio: float = 0.0
+    seed: int,
+    step: int,
+    slot: int,
+    rendered: bool,
+    height: int,
+    width: int,
+    more_views: bool,
+    real_ratio: float = 0.0,
+    target_zoom: int = TARGET_ZOOM,
 ) -> SampleSpec:
     """The sample at place `slot` of a step's batch, which depends on the run's seed and the step alone.
 
     rendered: whether it has target views. more_views: whether some samples have more than two context views.
-    real_ratio: probability of a capture.
+    real_ratio: probability of a capture. target_zoom: the largest zoom of a target view.
     """
     # All scenes of a step have the same number of views, so that no process waits for another.
     of_step, rng = np.random.default_rng((seed, step)), np.random.default_rng((seed, step, slot))
     context = sample_view_count(of_step, VIEW_COUNT_PROBABILITIES)
     scene = int(rng.integers(TRAINING_SEEDS.start, TRAINING_SEEDS.stop))
-    zooms = (1, int(rng.integers(2, MAX_TARGET_ZOOM + 1))) if rendered else ()
+    zooms = sample_target_zooms(rng, target_zoom) if rendered else ()
     return SampleSpec(scene, context if more_views else 2, zooms, height, width, real=bool(rng.random() < real_ratio))
 
 

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from idesplat.tools.training.perceptual import EfficientNetDistance, squared_distance
+from idesplat.tools.perceptual import EfficientNetDistance, squared_distance
 
 
 def test_distance_of_features_by_hand() -> None:

@@ -8,9 +8,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ...model.idesplat.efficientnet import OUT_INDICES, EfficientNetLite0
-from ...runtime.errors import InputError
-from .initialization import load_imagenet_weights
+from ..model.idesplat.efficientnet import OUT_INDICES, EfficientNetLite0
+from ..runtime.errors import InputError
+from .imagenet import load_imagenet_weights
 
 # Images [n, 3, H, W] in [0, 1], rendered and true -> their mean distance, a scalar.
 Perceptual = Callable[[Tensor, Tensor], Tensor]
