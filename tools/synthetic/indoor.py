@@ -2,15 +2,29 @@
 
 import numpy as np
 
-from .builder import ANY_KINDS, FLOOR_KINDS, Layout, SceneBuilder, add_room, lamplit_scene, random_rotation
+from .builder import (
+    ANY_KINDS,
+    FLOOR_KINDS,
+    Layout,
+    SceneBuilder,
+    add_room,
+    daylit_scene,
+    lamplit_scene,
+    random_rotation,
+)
 from .objects import (
     add_bowl,
+    add_bright_windows,
     add_chair,
     add_crates,
     add_cup,
+    add_cushion,
     add_lamp,
+    add_pierced_block,
     add_plant,
+    add_sculpture,
     add_small_object,
+    add_stone,
     add_table,
     furnish_wall,
 )
@@ -24,6 +38,27 @@ def furnished_room(rng: np.random.Generator, textures: Textures) -> Layout:
     width, height, length = add_room(builder)
     for wall in range(4):
         furnish_wall(builder, wall, width, height, length)
+    _furnish_middle(builder, width, length)
+    return Layout(lamplit_scene(builder, width, height, length), *_room_bounds(width, height, length))
+
+
+def daylit_room(rng: np.random.Generator, textures: Textures) -> Layout:
+    """A furnished room in which light comes from the windows of one wall: dark far from them."""
+    builder = SceneBuilder(rng, textures)
+    width, height, length = add_room(builder)
+    bright = int(rng.integers(4))
+    for wall in range(4):
+        if wall != bright:
+            furnish_wall(builder, wall, width, height, length)
+    windows = add_bright_windows(builder, bright, width, length)
+    _furnish_middle(builder, width, length)
+    scene = daylit_scene(builder, width, height, length, windows)
+    return Layout(scene, *_room_bounds(width, height, length))
+
+
+def _furnish_middle(builder: SceneBuilder, width: float, length: float) -> None:
+    """Add a carpet, a table and furniture away from the walls. width, length: of the room in metres."""
+    rng = builder.rng
     builder.position, builder.yaw = (rng.uniform(-0.2, 0.2) * width, 0.0, rng.uniform(-0.2, 0.2) * length), 0.0
     if rng.random() < 0.7:
         builder.box(
@@ -36,11 +71,15 @@ def furnished_room(rng: np.random.Generator, textures: Textures) -> Layout:
         builder.yaw = rng.uniform(0, 2 * np.pi)
         (add_chair, add_plant, add_crates, add_lamp)[rng.integers(4)](builder)
     builder.position, builder.yaw = (0.0, 0.0, 0.0), 0.0
+
+
+def _room_bounds(width: float, height: float, length: float) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds of camera centres and of look-at points in a room, as in `Layout`."""
     eye_bounds = np.array(
         [[-0.45 * width, -min(1.9, 0.8 * height), -0.45 * length], [0.45 * width, -0.8, 0.45 * length]]
     )
     focus_bounds = np.array([[-0.3 * width, -1.2, -0.3 * length], [0.3 * width, -0.4, 0.3 * length]])
-    return Layout(lamplit_scene(builder, width, height, length), eye_bounds, focus_bounds)
+    return eye_bounds, focus_bounds
 
 
 def clutter(rng: np.random.Generator, textures: Textures) -> Layout:
@@ -115,11 +154,33 @@ def covered_table(rng: np.random.Generator, textures: Textures) -> Layout:
     for _ in range(rng.integers(4, 12)):
         builder.position = (rng.uniform(-0.45, 0.45), -top, rng.uniform(-0.35, 0.35))
         builder.yaw = rng.uniform(0, 2 * np.pi)
-        (add_bowl, add_cup, add_small_object)[rng.integers(3)](builder, rng.uniform(0.04, 0.14))
+        (add_bowl, add_cup, add_small_object, add_stone)[rng.integers(4)](builder, rng.uniform(0.04, 0.14))
     builder.position, builder.yaw = (0.0, 0.0, 0.0), 0.0
     eye_bounds = np.array([[-1.0, -top - 0.8, -1.0], [1.0, -top - 0.15, 1.0]])
     focus_bounds = np.array([[-0.2, -top - 0.1, -0.2], [0.2, -top, 0.2]])
     return Layout(lamplit_scene(builder, width, height, length), eye_bounds, focus_bounds)
+
+
+def still_life(rng: np.random.Generator, textures: Textures) -> Layout:
+    """Hollow blocks, pipes, bags, cushions and stones on a table, in lamp light or in front of a window."""
+    builder = SceneBuilder(rng, textures)
+    width, height, length = add_room(builder)
+    windows = add_bright_windows(builder, int(rng.integers(4)), width, length) if rng.random() < 0.5 else []
+    builder.yaw, top = 0.0, 0.75
+    builder.position = (0.0, 0.0, 0.0)
+    board = builder.material(*FLOOR_KINDS, period=rng.uniform(0.4, 1.2))
+    builder.box(0, -top + 0.02, 0, rng.uniform(0.5, 1.2), 0.02, rng.uniform(0.4, 0.8), board)
+    builder.box(0, -top / 2 + 0.03, 0, 0.06, top / 2 - 0.03, 0.06, builder.material("wood", "plain"))
+    kinds = (add_stone, add_stone, add_cushion, add_sculpture, add_pierced_block, add_pierced_block)
+    for _ in range(rng.integers(5, 14)):
+        builder.position = (rng.uniform(-0.45, 0.45), -top, rng.uniform(-0.35, 0.35))
+        builder.yaw = rng.uniform(0, 2 * np.pi)
+        (*kinds, add_bowl, add_cup)[rng.integers(len(kinds) + 2)](builder, rng.uniform(0.04, 0.14))
+    builder.position, builder.yaw = (0.0, 0.0, 0.0), 0.0
+    lit = daylit_scene(builder, width, height, length, windows) if windows else None
+    eye_bounds = np.array([[-1.0, -top - 0.8, -1.0], [1.0, -top - 0.15, 1.0]])
+    focus_bounds = np.array([[-0.2, -top - 0.1, -0.2], [0.2, -top, 0.2]])
+    return Layout(lit or lamplit_scene(builder, width, height, length), eye_bounds, focus_bounds)
 
 
 def bars(rng: np.random.Generator, textures: Textures) -> Layout:

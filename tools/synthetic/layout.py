@@ -5,8 +5,18 @@ from collections.abc import Callable
 import numpy as np
 
 from .builder import Layout
-from .indoor import bars, cards, clutter, covered_table, furnished_room, table_top
-from .outdoor import around_object, facade, foliage, from_above, hills, street
+from .indoor import bars, cards, clutter, covered_table, daylit_room, furnished_room, still_life, table_top
+from .outdoor import (
+    around_object,
+    facade,
+    foliage,
+    from_above,
+    hills,
+    ruins,
+    sculpture,
+    street,
+    street_under_far_sky,
+)
 from .textures import Textures
 
 # Kinds of scenes; one that is repeated is more probable. The second tuple is used in training alone.
@@ -14,7 +24,10 @@ LAYOUTS: tuple[Callable[[np.random.Generator, Textures], Layout], ...] = (
     *(furnished_room, furnished_room, furnished_room),
     *(clutter, clutter, street, table_top, cards),
 )
-TRAINING_LAYOUTS = (facade, around_object, around_object, from_above, foliage, hills, covered_table, bars)
+TRAINING_LAYOUTS = (
+    *(facade, around_object, around_object, from_above, foliage, hills, covered_table, bars),
+    *(street_under_far_sky, ruins, sculpture, daylit_room, daylit_room, still_life),
+)
 
 
 def generate_layout(rng: np.random.Generator, textures: Textures, training: bool = False) -> Layout:

@@ -51,7 +51,8 @@ def make_scene(
     """Render images of a synthetic furnished room, with its cameras and exact depth."""
     from ...runtime.images.png import save_png
     from .layout import furnished_room
-    from .sampler import render, scene_textures
+    from .sampler import scene_textures
+    from .views import render
 
     images, depths, cameras = out_dir / "images", out_dir / "depth", out_dir / "transforms.json"
     names = [f"{index:03}" for index in range(views)]
@@ -90,7 +91,7 @@ def _intrinsics(width: int, height: int) -> np.ndarray:
 
 def _path(rng: np.random.Generator, layout: "Layout", intrinsics: np.ndarray, views: int) -> np.ndarray:
     """Camera-to-world poses [views, 4, 4] on a shallow arc: of CANDIDATES, that with the most depth edges in view."""
-    from .sampler import depth_edge_share, look_at, probe
+    from .views import depth_edge_share, look_at, probe
 
     best, best_score = np.empty(0), -np.inf
     for _ in range(CANDIDATES):
@@ -107,7 +108,7 @@ def _path(rng: np.random.Generator, layout: "Layout", intrinsics: np.ndarray, vi
 
 def _arc(middle: np.ndarray, distance: float, views: int) -> np.ndarray:
     """Poses [views, 4, 4] to both sides of `middle`, looking at a point at 1.5 times `distance` in front of it."""
-    from .sampler import look_at
+    from .views import look_at
 
     right, down, forward, eye = middle[:3].T
     steps = np.linspace(-0.5, 0.5, views)

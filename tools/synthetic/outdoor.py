@@ -9,21 +9,47 @@ from .builder import (
     WALL_KINDS,
     Layout,
     SceneBuilder,
+    add_ground_and_sky,
     add_open_ground,
     add_room,
+    cut_out,
     lamplit_scene,
     random_rotation,
     sunlit_scene,
 )
-from .objects import add_chair, add_crates, add_fence, add_plant, add_sign, add_tree
-from .raycast import BOX, CYLINDER, ELLIPSOID, HEIGHT_FIELD
+from .objects import (
+    THROUGH,
+    add_chair,
+    add_crates,
+    add_fence,
+    add_pierced_block,
+    add_pipes,
+    add_plant,
+    add_sculpture,
+    add_sign,
+    add_stone,
+    add_tree,
+    add_wall_with_opening,
+)
+from .raycast import BOX, CYLINDER, ELLIPSOID, FREE_FORM, HEIGHT_FIELD
 from .textures import Textures
 
 
 def street(rng: np.random.Generator, textures: Textures) -> Layout:
     """Open ground with buildings, trees, signs and boxes."""
     builder = SceneBuilder(rng, textures)
-    reach = add_open_ground(builder, *GROUND_KINDS)
+    return _street(builder, add_open_ground(builder, *GROUND_KINDS))
+
+
+def street_under_far_sky(rng: np.random.Generator, textures: Textures) -> Layout:
+    """A street whose sky has no parallax, in most scenes."""
+    builder = SceneBuilder(rng, textures)
+    return _street(builder, add_ground_and_sky(builder, 5.0, *GROUND_KINDS))
+
+
+def _street(builder: SceneBuilder, reach: float) -> Layout:
+    """Add buildings and objects to the ground. reach: its half extent in x and z."""
+    rng = builder.rng
     for _ in range(rng.integers(2, 7)):
         half_x, half_y, half_z = rng.uniform(1, 4), rng.uniform(1.2, 6), rng.uniform(1, 4)
         bearing, distance = rng.uniform(0, 2 * np.pi), rng.uniform(6, 0.8 * reach)
@@ -45,7 +71,7 @@ def street(rng: np.random.Generator, textures: Textures) -> Layout:
 def facade(rng: np.random.Generator, textures: Textures) -> Layout:
     """The front of a building with recessed windows, ledges and columns, and objects in front of it."""
     builder = SceneBuilder(rng, textures)
-    add_open_ground(builder, *GROUND_KINDS)
+    add_ground_and_sky(builder, 6.0, *GROUND_KINDS)
     wall = builder.material("brick", "cells", "plain", "noise", "wood", period=rng.uniform(0.8, 3.0))
     trim, pane = builder.material("plain", "noise", "speckle"), builder.material("plain", "gradient", "collage")
     half_x, height, depth = rng.uniform(4, 9), rng.uniform(3, 9), rng.uniform(0.05, 0.4)
@@ -71,12 +97,12 @@ def facade(rng: np.random.Generator, textures: Textures) -> Layout:
 
 
 def around_object(rng: np.random.Generator, textures: Textures) -> Layout:
-    """One object of intersecting solids, on the ground or on a stand, seen from nearby."""
+    """One object of intersecting solids, some cut or free-form, on the ground or on a stand, seen from nearby."""
     builder = SceneBuilder(rng, textures)
     outside = rng.random() < 0.5
     size = add_room(builder) if not outside else None
     if outside:
-        add_open_ground(builder, *GROUND_KINDS)
+        add_ground_and_sky(builder, 1.5, *GROUND_KINDS)
     top = rng.choice([0.0, rng.uniform(0.3, 0.9)])
     if top:
         stand = builder.material(*FURNITURE_KINDS)
@@ -86,8 +112,7 @@ def around_object(rng: np.random.Generator, textures: Textures) -> Layout:
     for _ in range(rng.integers(5, 24)):
         half = scale * np.exp(rng.normal(-0.9, 0.5, 3))
         centre = tuple(rng.normal(0, 0.5, 3) * scale - (0, top + scale, 0))
-        shape = int(rng.choice([BOX, ELLIPSOID, ELLIPSOID, CYLINDER]))
-        builder.add(shape, centre, tuple(half), materials[rng.integers(len(materials))], random_rotation(rng))
+        _add_part(builder, centre, tuple(half), materials[rng.integers(len(materials))])
     for _ in range(rng.integers(0, 5)):
         bearing, distance = rng.uniform(0, 2 * np.pi), rng.uniform(1.2, 2.5)
         builder.position, builder.yaw = (distance * np.cos(bearing), 0, distance * np.sin(bearing)), rng.uniform(0, 7)
@@ -101,10 +126,76 @@ def around_object(rng: np.random.Generator, textures: Textures) -> Layout:
     return Layout(scene, np.stack([eye - spread, eye + spread]), np.stack([focus - spread, focus + spread]))
 
 
+def _add_part(
+    builder: SceneBuilder, centre: tuple[float, float, float], half: tuple[float, float, float], material: int
+) -> None:
+    """Add a randomly turned solid that is plain, free-form, notched or bored."""
+    rng = builder.rng
+    turn = random_rotation(rng)
+    if rng.random() < 0.3:
+        squareness, bumps = rng.uniform(0, 1), rng.uniform(0.05, 0.35)
+        builder.add(FREE_FORM, centre, half, material, turn, squareness=squareness, bumps=bumps)
+        return
+    shape = int(rng.choice([BOX, ELLIPSOID, ELLIPSOID, CYLINDER]))
+    kind = rng.integers(4)
+    if kind == 0:
+        place, width = tuple(rng.uniform(-1, 1, 3)), tuple(rng.uniform(0.3, 0.8, 3))
+        builder.add(shape, centre, half, material, turn, cut_out(BOX, place, width))
+    elif kind == 1:
+        axes, radius = np.eye(3)[rng.permutation(3)], rng.uniform(0.3, 0.7)
+        builder.add(shape, centre, half, material, turn, cut_out(CYLINDER, (0, 0, 0), (radius, THROUGH, radius), axes))
+    else:
+        builder.add(shape, centre, half, material, turn)
+
+
+def sculpture(rng: np.random.Generator, textures: Textures) -> Layout:
+    """A free-form sculpture on a stand in the open, with stones, blocks and plants around it."""
+    builder = SceneBuilder(rng, textures)
+    add_ground_and_sky(builder, 3.0, *GROUND_KINDS)
+    top, size = rng.uniform(0.2, 0.9), rng.uniform(0.25, 0.5)
+    stand = builder.material(*FURNITURE_KINDS)
+    width = size * rng.uniform(0.8, 1.4)
+    builder.add(int(rng.choice([BOX, CYLINDER])), (0, -top / 2, 0), (width, top / 2, width), stand)
+    builder.position = (0.0, -top, 0.0)
+    add_sculpture(builder, size)
+    _scatter_ruins(builder, int(rng.integers(3, 9)), (1.2, 4.0))
+    focus = np.array([0.0, -top - size, 0.0])
+    eye_bounds = np.array([[-3.0, -top - 1.8, -3.0], [3.0, -top - 0.2, 3.0]])
+    return Layout(sunlit_scene(builder), eye_bounds, np.stack([focus - 0.3, focus + 0.3]))
+
+
+def ruins(rng: np.random.Generator, textures: Textures) -> Layout:
+    """Walls with doors, windows and arches, pipes, hollow blocks and stones in the open."""
+    builder = SceneBuilder(rng, textures)
+    add_ground_and_sky(builder, 4.0, *GROUND_KINDS)
+    for _ in range(rng.integers(2, 6)):
+        builder.position, builder.yaw = (rng.uniform(-4, 4), 0.0, rng.uniform(0, 6)), rng.normal(0, 0.5)
+        add_wall_with_opening(builder)
+    _scatter_ruins(builder, int(rng.integers(5, 12)), (1.0, 5.0))
+    eye_bounds = np.array([[-4, -2.2, -7], [4, -0.8, -3]])
+    return Layout(sunlit_scene(builder), eye_bounds, np.array([[-2, -1.2, 0], [2, -0.4, 3]]))
+
+
+def _scatter_ruins(builder: SceneBuilder, count: int, distances: tuple[float, float]) -> None:
+    """Add stones, hollow blocks, pipes and plants around the origin. distances: least and largest, in metres."""
+    rng = builder.rng
+    for _ in range(count):
+        bearing, distance = rng.uniform(0, 2 * np.pi), rng.uniform(*distances)
+        builder.position, builder.yaw = (distance * np.cos(bearing), 0.0, distance * np.sin(bearing)), rng.uniform(0, 7)
+        kind = rng.integers(6)
+        if kind < 2:
+            add_stone(builder, rng.uniform(0.1, 0.6))
+        elif kind == 2:
+            add_pierced_block(builder, rng.uniform(0.15, 0.5))
+        else:
+            (add_pipes, add_plant, add_tree)[kind - 3](builder)
+    builder.position, builder.yaw = (0.0, 0.0, 0.0), 0.0
+
+
 def from_above(rng: np.random.Generator, textures: Textures) -> Layout:
     """Houses, trees and roads, seen from above."""
     builder = SceneBuilder(rng, textures)
-    add_open_ground(builder, *GROUND_KINDS)
+    add_ground_and_sky(builder, 10.0, *GROUND_KINDS)
     for _ in range(rng.integers(1, 4)):
         builder.yaw = rng.uniform(0, np.pi)
         road = builder.material("plain", "noise", "speckle", period=3.0)
@@ -134,7 +225,7 @@ def from_above(rng: np.random.Generator, textures: Textures) -> Layout:
 def foliage(rng: np.random.Generator, textures: Textures) -> Layout:
     """Bushes of many thin leaves at many depths, in front of a wall or open ground."""
     builder = SceneBuilder(rng, textures)
-    add_open_ground(builder, "strokes", "noise", "cells")
+    add_ground_and_sky(builder, 2.5, "strokes", "noise", "cells")
     if rng.random() < 0.5:
         builder.box(0, -1.5, 2.5, 5, 1.5, 0.1, builder.material(*WALL_KINDS, period=2.0))
     for _ in range(rng.integers(2, 5)):
@@ -158,7 +249,7 @@ def foliage(rng: np.random.Generator, textures: Textures) -> Layout:
 def hills(rng: np.random.Generator, textures: Textures) -> Layout:
     """Uneven ground with rocks, trees and fences, under the sky."""
     builder = SceneBuilder(rng, textures)
-    add_open_ground(builder, *GROUND_KINDS)
+    add_ground_and_sky(builder, 6.0, *GROUND_KINDS)
     rise = np.exp(rng.uniform(np.log(0.1), np.log(1.5)))
     ground = builder.material("strokes", "noise", "cells", "speckle", period=rng.uniform(0.8, 4.0))
     builder.add(HEIGHT_FIELD, (0, -rise, 0), (9.0, rise, 9.0), ground)
@@ -166,7 +257,8 @@ def hills(rng: np.random.Generator, textures: Textures) -> Layout:
     for _ in range(rng.integers(3, 14)):
         size = rng.uniform(0.1, 0.7)
         centre = (rng.uniform(-4, 4), -1.2 * rise, rng.uniform(-4, 4))
-        builder.add(ELLIPSOID, centre, tuple(size * np.exp(rng.normal(0, 0.4, 3))), rock, random_rotation(rng))
+        half, turn, bumps = tuple(size * np.exp(rng.normal(0, 0.4, 3))), random_rotation(rng), rng.uniform(0.05, 0.3)
+        builder.add(FREE_FORM, centre, half, rock, turn, squareness=rng.uniform(0, 1), bumps=bumps)
     for _ in range(rng.integers(1, 7)):
         builder.position = (rng.uniform(-5, 5), -rise, rng.uniform(-3, 6))
         builder.yaw = rng.uniform(0, 2 * np.pi)

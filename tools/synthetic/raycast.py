@@ -1,8 +1,8 @@
-"""A compiled ray caster: exact z-depth and antialiased colour of boxes, ellipsoids, cylinders and height fields.
+"""A compiled ray caster: exact z-depth and antialiased colour of boxes, ellipsoids, cylinders and wavy solids.
 
 Ray directions have z = 1 in the camera frame, so that the ray parameter is the z-depth. Each solid is a unit cube,
-ball, cylinder or height field in its own frame, scaled by `halves`, less the ball of `cuts`. For each tile of the image
-only the solids whose bounding rectangle overlaps it are intersected, nearest first.
+ball, cylinder, height field or free-form solid in its own frame, scaled by `halves`, less the solid of `cuts`. For each
+tile of the image only the solids whose bounding rectangle overlaps it are intersected, nearest first.
 
 Intersection and shading are in one module, since numba's cache does not notice changes in the modules that are inlined.
 """
@@ -15,14 +15,25 @@ from ...runtime.system.compilation import compiled
 from .scene import WAVES, Scene
 from .textures import LEVELS, SIZE
 
-# The cylinder's axis is its local y. A height field is the part of the cube below a surface of waves.
-BOX, ELLIPSOID, CYLINDER, HEIGHT_FIELD = 0, 1, 2, 3
+# The cylinder's axis is its local y. A height field is the part of the cube below a surface of waves; a free-form solid
+# is between a ball and a rounded cube, with waves on its surface. The last two cannot be cut.
+BOX, ELLIPSOID, CYLINDER, HEIGHT_FIELD, FREE_FORM = 0, 1, 2, 3, 4
+UNCUT = -1  # in `Scene.cut_shapes`
+# A material that emits at least this much is lit by nothing else: a far sky, and some panes of bright windows.
+LUMINOUS = 1.0
+# The face of all of a sky, an enclosing ellipsoid: its texture coordinates are x and y, which have no seam.
+SKY_FACE = 4
 # Steps in which the surface of a height field is searched along a ray, and halvings of the step in which it is found.
 MARCH_STEPS, BISECTIONS = 32, 26
+# Least step in the unit frame in which the surface of a free-form solid is searched; shorter chords may be missed.
+LEAST_STEP = 0.01
 TILE = 8  # pixels
 ON_SURFACE = 1e-9  # largest distance from a surface of a point on it, in the unit frame
 NEAR = 1e-3  # metres; nearer hits are the surface from which the ray starts
 LAMP_SAMPLES = 6  # shadow rays to points along a lamp
+# Beyond FAR_LIGHT metres a light is a sun in front of a far sky. Its shadow rays end after SHADOW_REACH metres, since
+# `_unit_hit` leaves out the first NEAR of a segment, which would be metres of one that reaches the sun.
+FAR_LIGHT, SHADOW_REACH = 300.0, 60.0
 # Ambient occlusion in the corners of the enclosing solid: its range in metres, and its strength.
 CORNER_RANGE, CORNER_STRENGTH = 0.35, 0.35
 
@@ -240,50 +251,168 @@ def _first_hit(
 def _unit_hit(scene: Scene, solid: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float) -> float:
     """The first t > NEAR at which o + t d meets the surface of a solid, in its unit frame; infinity if it does not."""
     shape = scene.shapes[solid]
-    if shape == ELLIPSOID:
-        enter, leave = _quadratic(
-            dx * dx + dy * dy + dz * dz, ox * dx + oy * dy + oz * dz, ox * ox + oy * oy + oz * oz - 1.0
-        )
-    else:
-        enter, leave = _slab(oy, dy)
-        if shape == CYLINDER:
-            enter_r, leave_r = _quadratic(dx * dx + dz * dz, ox * dx + oz * dz, ox * ox + oz * oz - 1.0)
-            enter, leave = max(enter, enter_r), min(leave, leave_r)
-        else:
-            enter_x, leave_x = _slab(ox, dx)
-            enter_z, leave_z = _slab(oz, dz)
-            enter, leave = max(enter, enter_x, enter_z), min(leave, leave_x, leave_z)
+    enter, leave = _interval(shape, ox, oy, oz, dx, dy, dz)
     if not (enter <= leave and leave > NEAR):
         return np.inf
     if shape == HEIGHT_FIELD:
         return _height_hit(scene.waves, solid, (ox, oy, oz), (dx, dy, dz), enter, leave)
-    if scene.cuts[solid, 3] > 0.0:
-        return _cut_hit(scene.cuts, solid, (ox, oy, oz), (dx, dy, dz), enter, leave)
+    if shape == FREE_FORM:
+        return _free_form_hit(scene.waves, scene.forms, solid, (ox, oy, oz), (dx, dy, dz), enter, leave)
+    if scene.cut_shapes[solid] != UNCUT:
+        return _cut_hit(scene.cuts, scene.cut_shapes[solid], solid, (ox, oy, oz), (dx, dy, dz), enter, leave)
     return enter if enter > NEAR else leave
 
 
 @_inlined()
+def _interval(shape: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float) -> tuple[float, float]:
+    """The interval of a line o + t d in a unit ball, cylinder or, for all other shapes, cube; enter > leave if none."""
+    if shape == ELLIPSOID:
+        return _quadratic(dx * dx + dy * dy + dz * dz, ox * dx + oy * dy + oz * dz, ox * ox + oy * oy + oz * oz - 1.0)
+    enter, leave = _slab(oy, dy)
+    if shape == CYLINDER:
+        enter_r, leave_r = _quadratic(dx * dx + dz * dz, ox * dx + oz * dz, ox * ox + oz * oz - 1.0)
+        return max(enter, enter_r), min(leave, leave_r)
+    enter_x, leave_x = _slab(ox, dx)
+    enter_z, leave_z = _slab(oz, dz)
+    return max(enter, enter_x, enter_z), min(leave, leave_x, leave_z)
+
+
+@_compiled()  # a call: inlined it would make the loop over the solids slower for scenes without cuts
 def _cut_hit(
     cuts: np.ndarray,
+    cut_shape: int,
     solid: int,
     origin: tuple[float, float, float],
     direction: tuple[float, float, float],
     enter: float,
     leave: float,
 ) -> float:
-    """The first surface of a solid that a ray is in from `enter` to `leave`, less the ball that is cut out of it."""
-    ox, oy, oz = origin[0] - cuts[solid, 0], origin[1] - cuts[solid, 1], origin[2] - cuts[solid, 2]
-    dx, dy, dz = direction
-    into, out = _quadratic(
-        dx * dx + dy * dy + dz * dz, ox * dx + oy * dy + oz * dz, ox * ox + oy * oy + oz * oz - cuts[solid, 3] ** 2
-    )
-    # What is left of the interval: before the ball, and behind it.
+    """The first surface of a solid that a ray is in from `enter` to `leave`, less what is cut out of it."""
+    ox, oy, oz = _in_cut(cuts, solid, origin[0], origin[1], origin[2], 1.0)
+    dx, dy, dz = _in_cut(cuts, solid, direction[0], direction[1], direction[2], 0.0)
+    into, out = _interval(cut_shape, ox, oy, oz, dx, dy, dz)
+    if into > out:
+        return enter if enter > NEAR else leave
+    # What is left of the interval: before the cut, and behind it.
     end, start = min(leave, into), max(enter, out)
     if enter <= end and end > NEAR:
         return enter if enter > NEAR else end
     if start <= leave and leave > NEAR:
         return start if start > NEAR else leave
     return np.inf
+
+
+@_inlined()
+def _in_cut(cuts: np.ndarray, solid: int, x: float, y: float, z: float, w: float) -> tuple[float, float, float]:
+    """A point (w = 1) or direction (w = 0) of the solid's unit frame in the unit frame of what is cut out of it."""
+    return (
+        cuts[solid, 0, 0] * x + cuts[solid, 0, 1] * y + cuts[solid, 0, 2] * z + cuts[solid, 0, 3] * w,
+        cuts[solid, 1, 0] * x + cuts[solid, 1, 1] * y + cuts[solid, 1, 2] * z + cuts[solid, 1, 3] * w,
+        cuts[solid, 2, 0] * x + cuts[solid, 2, 1] * y + cuts[solid, 2, 2] * z + cuts[solid, 2, 3] * w,
+    )
+
+
+@_inlined()
+def _cut_normal(scene: Scene, solid: int, ux: float, uy: float, uz: float) -> tuple[bool, float, float, float]:
+    """Whether a surface point in the unit frame is on the surface of the cut, and the normal in the local frame.
+
+    The normal is not of unit length.
+    """
+    shape = scene.cut_shapes[solid]
+    x, y, z = _in_cut(scene.cuts, solid, ux, uy, uz, 1.0)
+    nx, ny, nz = x, y, z
+    if shape == ELLIPSOID:
+        gap = np.sqrt(x * x + y * y + z * z) - 1.0
+    elif shape == CYLINDER:
+        across, along = np.sqrt(x * x + z * z) - 1.0, abs(y) - 1.0
+        gap = max(across, along)
+        nx, ny, nz = (x, 0.0, z) if across > along else (0.0, y, 0.0)
+    else:
+        ax, ay, az = abs(x), abs(y), abs(z)
+        gap = max(ax, ay, az) - 1.0
+        nx, ny, nz = (x, 0.0, 0.0) if ax >= max(ay, az) else ((0.0, y, 0.0) if ay >= az else (0.0, 0.0, z))
+    cuts, halves = scene.cuts, scene.halves  # a normal is transformed by the transpose
+    return (
+        abs(gap) < ON_SURFACE,
+        (cuts[solid, 0, 0] * nx + cuts[solid, 1, 0] * ny + cuts[solid, 2, 0] * nz) / halves[solid, 0],
+        (cuts[solid, 0, 1] * nx + cuts[solid, 1, 1] * ny + cuts[solid, 2, 1] * nz) / halves[solid, 1],
+        (cuts[solid, 0, 2] * nx + cuts[solid, 1, 2] * ny + cuts[solid, 2, 2] * nz) / halves[solid, 2],
+    )
+
+
+@_compiled()
+def _free_form_hit(
+    waves: np.ndarray,
+    forms: np.ndarray,
+    solid: int,
+    origin: tuple[float, float, float],
+    direction: tuple[float, float, float],
+    enter: float,
+    leave: float,
+) -> float:
+    """The first surface of a free-form solid whose cube a ray is in from `enter` to `leave`.
+
+    Steps are as long as the implicit function's largest slope allows, but at least LEAST_STEP; where the sign changes,
+    the surface is found by bisection.
+    """
+    (ox, oy, oz), (dx, dy, dz) = origin, direction
+    speed = np.sqrt(dx * dx + dy * dy + dz * dz)
+    low = max(enter, NEAR)
+    value = _form(waves, forms, solid, ox + low * dx, oy + low * dy, oz + low * dz)
+    inside = value < 0.0
+    while low < leave:
+        high = low + max(abs(value) / forms[solid, 1], LEAST_STEP) / speed
+        value = _form(waves, forms, solid, ox + high * dx, oy + high * dy, oz + high * dz)
+        if (value < 0.0) != inside:
+            for _ in range(BISECTIONS):
+                middle = 0.5 * (low + high)
+                if (_form(waves, forms, solid, ox + middle * dx, oy + middle * dy, oz + middle * dz) < 0.0) == inside:
+                    low = middle
+                else:
+                    high = middle
+            return high
+        low = high
+    return np.inf
+
+
+@_inlined()
+def _form(waves: np.ndarray, forms: np.ndarray, solid: int, x: float, y: float, z: float) -> float:
+    """The implicit function of a free-form solid at a point of the unit frame, negative inside.
+
+    f = |p| - 1 + sum a (1 + p(kx x + ky y + kz z + phase)) over waves (kx, kz, phase, a, ky), p as in `_height`; the
+    norm |p| is (1 - s) |p|_2 + s |p|_4 for the squareness s: a ball at 0, a rounded cube at 1.
+    """
+    xx, yy, zz = x * x, y * y, z * z
+    square = forms[solid, 0]
+    value = (1.0 - square) * np.sqrt(xx + yy + zz) + square * np.sqrt(np.sqrt(xx * xx + yy * yy + zz * zz)) - 1.0
+    for wave in range(WAVES):
+        turn = _space_turn(waves, solid, wave, x, y, z)
+        value += waves[solid, wave, 3] * (1.0 + 8.0 * turn * (1.0 - 2.0 * abs(turn)))
+    return value
+
+
+@_inlined()
+def _form_slope(
+    waves: np.ndarray, forms: np.ndarray, solid: int, x: float, y: float, z: float
+) -> tuple[float, float, float]:
+    """The derivatives of `_form` by x, y and z."""
+    xx, yy, zz = x * x, y * y, z * z
+    by_ball = (1.0 - forms[solid, 0]) / np.sqrt(xx + yy + zz)
+    by_cube = forms[solid, 0] / (xx * xx + yy * yy + zz * zz) ** 0.75
+    by_x, by_y, by_z = x * (by_ball + by_cube * xx), y * (by_ball + by_cube * yy), z * (by_ball + by_cube * zz)
+    for wave in range(WAVES):
+        turn = _space_turn(waves, solid, wave, x, y, z)
+        slope = waves[solid, wave, 3] * 8.0 * (1.0 - 4.0 * abs(turn))
+        by_x, by_z = by_x + slope * waves[solid, wave, 0], by_z + slope * waves[solid, wave, 1]
+        by_y += slope * waves[solid, wave, 4]
+    return by_x, by_y, by_z
+
+
+@_inlined()
+def _space_turn(waves: np.ndarray, solid: int, wave: int, x: float, y: float, z: float) -> float:
+    """The phase of one wave of a free-form solid at a point, in periods, from -1/2 to 1/2."""
+    turn = waves[solid, wave, 0] * x + waves[solid, wave, 4] * y + waves[solid, wave, 1] * z + waves[solid, wave, 2]
+    return turn - np.floor(turn + 0.5)
 
 
 @_inlined()
@@ -374,11 +503,16 @@ def _face(scene: Scene, solid: int, ux: float, uy: float, uz: float) -> tuple[in
     """
     shape = scene.shapes[solid]
     nx, ny, nz = ux / scene.halves[solid, 0], uy / scene.halves[solid, 1], uz / scene.halves[solid, 2]
-    cx, cy, cz = ux - scene.cuts[solid, 0], uy - scene.cuts[solid, 1], uz - scene.cuts[solid, 2]
-    radius = scene.cuts[solid, 3]
-    if radius > 0.0 and abs(np.sqrt(cx * cx + cy * cy + cz * cz) - radius) < ON_SURFACE:
-        nx, ny, nz = cx / scene.halves[solid, 0], cy / scene.halves[solid, 1], cz / scene.halves[solid, 2]
-        shape = ELLIPSOID
+    on_cut, cut_x, cut_y, cut_z = False, 0.0, 0.0, 0.0
+    if scene.cut_shapes[solid] != UNCUT:
+        on_cut, cut_x, cut_y, cut_z = _cut_normal(scene, solid, ux, uy, uz)
+    if on_cut:
+        nx, ny, nz, shape = cut_x, cut_y, cut_z, ELLIPSOID
+    elif shape == FREE_FORM:
+        nx, ny, nz = _form_slope(scene.waves, scene.forms, solid, ux, uy, uz)
+        nx, ny, nz = nx / scene.halves[solid, 0], ny / scene.halves[solid, 1], nz / scene.halves[solid, 2]
+    elif shape == ELLIPSOID and solid == 0:
+        return SKY_FACE, nx, ny, nz
     elif shape == HEIGHT_FIELD and max(abs(ux), abs(uy), abs(uz)) < 1.0 - ON_SURFACE:
         by_x, by_z = _height_slope(scene.waves, solid, ux, uz)
         nx, ny, nz = by_x / scene.halves[solid, 0], -1.0 / scene.halves[solid, 1], by_z / scene.halves[solid, 2]
@@ -428,6 +562,8 @@ def _light(
     spread = np.log2(SIZE * scene.frequencies[material] * z * length / np.sqrt(max(-slope, 0.02)))
     dim = _corner_occlusion(scene, unit_point, face) if solid == 0 else 1.0
     emission = scene.emissions[material]
+    if emission >= LUMINOUS:
+        return emission, emission, emission, 0.0, spread
     light_r, light_g, light_b = scene.ambient[0], scene.ambient[1], scene.ambient[2]
     specular = 0.0
     for light in range(len(scene.light_lengths)):
@@ -558,6 +694,9 @@ def _lamp_visibility(
 def _blocked(scene: Scene, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float) -> bool:
     """Whether the segment from o to o + d meets a solid, except the enclosing one and emissive ones."""
     squared = dx * dx + dy * dy + dz * dz
+    if squared > FAR_LIGHT * FAR_LIGHT:
+        shorter = SHADOW_REACH / np.sqrt(squared)
+        dx, dy, dz, squared = shorter * dx, shorter * dy, shorter * dz, SHADOW_REACH * SHADOW_REACH
     for solid in range(1, len(scene.shapes)):
         # Bounding sphere against the line.
         wx, wy, wz = scene.centres[solid, 0] - ox, scene.centres[solid, 1] - oy, scene.centres[solid, 2] - oz

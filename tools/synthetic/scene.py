@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-WAVES = 4  # of a height field
+WAVES = 4  # of a height field or a free-form solid
 
 
 class Scene(NamedTuple):
@@ -14,12 +14,14 @@ class Scene(NamedTuple):
     the texture; its colour is `colour @ (r, g, b, 1)` for a texel (r, g, b).
     """
 
-    shapes: np.ndarray  # [solids] int64: BOX, ELLIPSOID, CYLINDER or HEIGHT_FIELD
+    shapes: np.ndarray  # [solids] int64: BOX, ELLIPSOID, CYLINDER, HEIGHT_FIELD or FREE_FORM
     centres: np.ndarray  # [solids, 3]
     axes: np.ndarray  # [solids, 3, 3], rows: the local axes in the world
     halves: np.ndarray  # [solids, 3], half extents along the local axes
-    cuts: np.ndarray  # [solids, 4], centre and radius of a ball that is cut out, in the unit frame; radius 0: none
-    waves: np.ndarray  # [solids, WAVES, 4], of height fields (`_height` in raycast.py)
+    cut_shapes: np.ndarray  # [solids] int64, of what is cut out: BOX, ELLIPSOID, CYLINDER or UNCUT
+    cuts: np.ndarray  # [solids, 3, 4], from the solid's unit frame to that of what is cut out: `cuts @ (x, y, z, 1)`
+    waves: np.ndarray  # [solids, WAVES, 5], of height fields and free-form solids (`_height`, `_form` in raycast.py)
+    forms: np.ndarray  # [solids, 2], of free-form solids: squareness, and upper bound of the slope of `_form`
     materials: np.ndarray  # [solids, 6] int64, of the faces -x, +x, -y, +y, -z, +z
     textures: np.ndarray  # [materials] int64, index of a texture
     uv: np.ndarray  # [materials, 2, 3]

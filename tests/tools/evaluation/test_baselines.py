@@ -20,7 +20,8 @@ from idesplat.tools.evaluation.cases import PosedImages, find_covisible, synthet
 from idesplat.tools.evaluation.image_folders import load_case
 from idesplat.tools.evaluation.metrics import psnr
 from idesplat.tools.evaluation.novel_views import render_target
-from idesplat.tools.synthetic.sampler import HELD_OUT_SEEDS, look_at
+from idesplat.tools.synthetic.sampler import HELD_OUT_SEEDS
+from idesplat.tools.synthetic.views import look_at
 
 HEIGHT, WIDTH, DEPTH = 60, 80, 4.0
 INTRINSICS = np.array([[1.1, 0, 0.52], [0, 1.4, 0.47], [0, 0, 1]])

@@ -15,7 +15,7 @@ from idesplat.runtime.images.finding import find_images
 from idesplat.runtime.views.batch import ViewBatch, build_view_batch, match_images_to_cameras
 from idesplat.runtime.views.depth_range import DepthRange
 from idesplat.tools.evaluation.image_folders import Frame, context_for, load_case, split_frames
-from idesplat.tools.synthetic.sampler import look_at
+from idesplat.tools.synthetic.views import look_at
 
 SIZE = HEIGHT, WIDTH = 64, 96  # of images 96 x 128: scaled to 72 x 96, four rows cut above and below
 

@@ -192,10 +192,21 @@ def test_curriculum_goes_from_coarse_to_fine_and_lr_decays() -> None:
     assert half == pytest.approx(1000 * (0.74 + (0.05 + (4.39 - 0.05) / 2 - 1.01) / 11), abs=1.5)
 
 
+def test_images_of_many_views_are_smaller() -> None:
+    """Six views of 192x192 have 3.4 times the pixels of a view of 256x256."""
+    specs = [training_spec(5, step, 0, True, 256, 320, more_views=True) for step in range(200)]
+    assert {(spec.context, spec.height, spec.width) for spec in specs} == {
+        *((views, 256, 320) for views in (2, 3, 4)),
+        (6, 192, 224),
+    }
+    two_views = (training_spec(5, step, 0, False, 256, 256, more_views=False) for step in range(200))
+    assert {(spec.context, spec.height) for spec in two_views} == {(2, 256)}
+
+
 def test_prefetched_samples_keep_their_order_and_repeat() -> None:
     specs = [training_spec(5, step, 0, True, 32, 32, more_views=True) for step in range(120)]
     assert specs == [training_spec(5, step, 0, True, 32, 32, more_views=True) for step in range(120)]
-    assert len({spec.seed for spec in specs}) == 120 and {spec.context for spec in specs} == {2, 3, 4}
+    assert len({spec.seed for spec in specs}) == 120 and {spec.context for spec in specs} == {2, 3, 4, 6}
     assert specs[7].context == training_spec(5, 7, 1, True, 32, 32, more_views=True).context
     loaded = list(prefetch(iter(specs[:7]), generate_views))
     for spec, views in zip(specs, loaded, strict=False):

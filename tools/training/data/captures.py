@@ -19,7 +19,7 @@ from ....runtime.inference.normalization import SceneNormalization
 from ....runtime.views.batch import ViewBatch, build_view_batch
 from ....runtime.views.depth_range import estimate_depth_range
 from ....runtime.views.loader import load_view
-from ...synthetic.sampler import zoom_intrinsics
+from ...synthetic.views import zoom_intrinsics
 from .pointmaps import check_pointmap, load_pointmap
 from .samples import SampleSpec, TrainingViews
 

@@ -12,8 +12,11 @@ from ...synthetic.textures import Textures
 from ..options import TARGET_ZOOM
 from .samples import SampleSpec, TrainingViews
 
-# Numbers of context views once there is more than one DPBU, and their probabilities. Six take 7 GB in training.
-VIEW_COUNT_PROBABILITIES = {2: 0.87, 3: 0.08, 4: 0.05}
+# Numbers of context views once there is more than one DPBU, and their probabilities.
+VIEW_COUNT_PROBABILITIES = {2: 0.85, 3: 0.07, 4: 0.05, 6: 0.03}
+# Images of more views are smaller, so that a scene of six takes no more memory than one of four: their side is this
+# share of that of other scenes, in multiples that every network takes.
+MANY_VIEWS, MANY_VIEWS_SIDE, SIDE_MULTIPLE = 5, 0.75, 32
 
 
 def sample_view_count(rng: np.random.Generator, probabilities: dict[int, float]) -> int:
@@ -39,15 +42,26 @@ def training_spec(
 ) -> SampleSpec:
     """The sample at place `slot` of a step's batch, which depends on the run's seed and the step alone.
 
-    rendered: whether it has target views. more_views: whether some samples have more than two context views.
-    real_ratio: probability of a capture. target_zoom: the largest zoom of a target view.
+    rendered: whether it has target views. height, width: in pixels, of scenes with fewer than MANY_VIEWS context views.
+    more_views: whether some samples have more than two context views. real_ratio: probability of a capture.
+    target_zoom: the largest zoom of a target view.
     """
     # All scenes of a step have the same number of views, so that no process waits for another.
     of_step, rng = np.random.default_rng((seed, step)), np.random.default_rng((seed, step, slot))
     context = sample_view_count(of_step, VIEW_COUNT_PROBABILITIES)
     scene = int(rng.integers(TRAINING_SEEDS.start, TRAINING_SEEDS.stop))
     zooms = sample_target_zooms(rng, target_zoom) if rendered else ()
-    return SampleSpec(scene, context if more_views else 2, zooms, height, width, real=bool(rng.random() < real_ratio))
+    real = bool(rng.random() < real_ratio)
+    if not more_views:
+        return SampleSpec(scene, 2, zooms, height, width, real=real)
+    if context >= MANY_VIEWS:
+        height, width = (_smaller_side(side) for side in (height, width))
+    return SampleSpec(scene, context, zooms, height, width, real=real)
+
+
+def _smaller_side(side: int) -> int:
+    """The side of images of many views, in pixels."""
+    return max(int(MANY_VIEWS_SIDE * side) // SIDE_MULTIPLE, 1) * SIDE_MULTIPLE
 
 
 def generate_views(spec: SampleSpec, photos: Path | None = None) -> TrainingViews:
