@@ -3,7 +3,7 @@
 import numpy as np
 
 from ...runtime.geometry.intrinsics import crop_intrinsics, denormalize_intrinsics, scale_intrinsics
-from .raycast import Scene, cast_rays
+from .raycast import ELLIPSOID, Scene, cast_rays
 from .textures import Textures
 
 # Side in pixels of the small depth map from which a camera pose is scored.
@@ -49,7 +49,15 @@ def probe(scene: Scene, pose: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
     """A small depth map [PROBE, PROBE]; all zeros if the camera is outside the enclosing solid."""
     bare = Textures(np.zeros((1, 1, 3), np.uint8), ())
     _, depth = render(scene, bare, pose, intrinsics, PROBE, PROBE, 0)
-    return depth if np.isfinite(depth).all() else np.zeros_like(depth)
+    inside = is_enclosed(scene, pose[:3, 3]) and np.isfinite(depth).all()
+    return depth if inside else np.zeros_like(depth)
+
+
+def is_enclosed(scene: Scene, point: np.ndarray) -> bool:
+    """Whether a point [3] is inside the enclosing solid, a box or an ellipsoid. From outside some rays hit nothing."""
+    unit = scene.axes[0] @ (point - scene.centres[0]) / scene.halves[0]
+    size = np.linalg.norm(unit) if scene.shapes[0] == ELLIPSOID else np.abs(unit).max()
+    return bool(size < 1)
 
 
 def depth_edge_share(seen: np.ndarray) -> float:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from grey_scenes import scene_of
 from idesplat.tools.evaluation.captures import camera_statistics as statistics
 from idesplat.tools.evaluation.captures.camera_statistics import quantiles_of, sample_statistics
 from idesplat.tools.synthetic.placement import (
@@ -13,8 +14,11 @@ from idesplat.tools.synthetic.placement import (
     _sample_neighbour_poses,
     arc,
 )
+from idesplat.tools.synthetic.raycast import BOX, ELLIPSOID
 from idesplat.tools.synthetic.sampler import HELD_OUT_SEEDS, VALIDATION_SEEDS, Sample, generate_sample
-from idesplat.tools.synthetic.views import PROBE, look_at
+from idesplat.tools.synthetic.views import PROBE, look_at, probe
+
+TELE = np.array([[3.0, 0, 0.5], [0, 3.0, 0.5], [0, 0, 1]])  # normalised intrinsics: 19 degrees
 
 # Positions of three context views and two targets, in scene units, and the focal lengths and the principal point of all
 # views. Computed at commit 31e3e69, before training scenes had cameras of their own.
@@ -172,3 +176,13 @@ def test_pairs_of_training_views_cover_those_of_captures() -> None:
 def test_level_cameras_do_not_pass_above_what_they_look_at() -> None:
     axes = np.concatenate([sample_of(seed, 3).extrinsics[:, :3, 2] for seed in range(40)])
     assert np.abs(axes[:, 1]).max() <= TRAINING_PLACEMENT.steepest + 1e-6
+
+
+@pytest.mark.parametrize(("shape", "inside", "outside"), [(BOX, 9, 11), (ELLIPSOID, 5, 6)])
+def test_a_camera_outside_the_enclosing_solid_sees_nothing(shape: int, inside: float, outside: float) -> None:
+    """It looks inwards through a wall, so that every ray hits something. 5 and 6 on each axis are 8.7 and 10.4 away."""
+    scene = scene_of()._replace(shapes=np.array([shape]))
+    eyes = [np.array([0.0, 0.0, side]) if shape == BOX else np.full(3, float(side)) for side in (inside, outside)]
+    seen = [probe(scene, look_at(eye, np.array([0.0, 0.0, 0.1])), TELE) for eye in eyes]
+    assert seen[0].min() > 10
+    assert (seen[1] == 0).all()
