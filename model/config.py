@@ -68,6 +68,9 @@ class EncoderConfig(ABC):
     # Whether Gaussians' scales are predicted in pixels at their depth, and not in scene units as in the releases. The
     # focal length is no input, so scales in scene units fit one field of view and one image size.
     scale_in_pixels: bool = False
+    # Whether Gaussians' scales and rotations are predicted in the frame of the surface that the depth map shows, and
+    # not in the camera's as in the releases: slanted surfaces then have no gaps for other views.
+    surface_frame: bool = False
     # The depth range it was trained with, in scene units.
     near: float = 0.5
     far: float = 100.0

@@ -8,8 +8,9 @@ from torch import Tensor, nn
 
 from ..config import EncoderConfig
 from .geometry import Cameras, unproject
-from .quaternions import matrices_to_quaternions, quaternion_product
+from .quaternions import matrices_to_quaternions, pairwise_product, quaternion_product
 from .sh import SH_0, sh_rotation
+from .surface_frame import surface_frames
 
 # The releases shift the raw scale before softplus, so that Gaussians start at about a pixel's size.
 SCALE_SHIFT = 4.0
@@ -39,6 +40,7 @@ class GaussianAdapter(nn.Module):
         mean = c + depth * R K^-1 [u + sigmoid(dx), v + sigmoid(dy), 1]   (u, v: the pixel's upper left corner)
         scale = clamp(softplus(s - 4), scale_min, scale_max), times the pixel's size at its depth if `scale_in_pixels`
         quaternion = q(R) q,  opacity = sigmoid(logit)
+        with `surface_frame`: scale times the pixel's size on the surface, quaternion = q(R) q(S) q   (`surface_frames`)
         sh = M(R) (decay * sh + [(colour - 0.5) / Y_0, 0, ...])           (`sh_rotation`)
 
     with R and c the camera-to-world rotation and the camera centre.
@@ -49,6 +51,7 @@ class GaussianAdapter(nn.Module):
     def __init__(self, config: EncoderConfig) -> None:
         super().__init__()
         self.scale_min, self.scale_max, self.in_pixels = config.scale_min, config.scale_max, config.scale_in_pixels
+        self.in_surface = config.surface_frame
         self.coefficients, sh_degree = config.sh_coefficients, config.sh_degree
         decay = [
             SH_WEIGHT * SH_DECAY**band if band else 1.0 for band in range(sh_degree + 1) for _ in range(2 * band + 1)
@@ -64,7 +67,11 @@ class GaussianAdapter(nn.Module):
         if self.in_pixels:
             scales = scales * self._pixel_sizes(depth, cameras)
         camera = cameras.extrinsics[:, :3, :3]
-        quats = quaternion_product(matrices_to_quaternions(camera), _normalise_quaternion(rotations))
+        quats = _normalise_quaternion(rotations)
+        if self.in_surface:
+            to_camera, sizes = surface_frames(1 / depth, cameras)
+            scales, quats = scales * sizes, pairwise_product(to_camera, quats)
+        quats = quaternion_product(matrices_to_quaternions(camera), quats)
         sh = self._world_sh(sh.unflatten(1, (3, self.coefficients)), (images.flatten(2) - 0.5) / SH_0, camera)
         gaussians = WorldGaussians(means, scales, quats, logits.sigmoid()[..., 0], sh)
         return WorldGaussians(*(x.flatten(0, 1) for x in gaussians))

@@ -27,6 +27,16 @@ def quaternion_product(a: Tensor, b: Tensor) -> Tensor:
     return b @ left.transpose(1, 2)
 
 
+def pairwise_product(a: Tensor, b: Tensor) -> Tensor:
+    """The rotations b followed by a, each of its own, both wxyz [..., 4]."""
+    left, right = a.unbind(-1), b.unbind(-1)
+    rows = []
+    for partners, signs in zip(PARTNERS, SIGNS, strict=True):
+        w, x, y, z = (sign * left[partner] * other for sign, partner, other in zip(signs, partners, right, strict=True))
+        rows.append(w + x + y + z)
+    return torch.stack(rows, dim=-1)
+
+
 def matrices_to_quaternions(rotation: Tensor) -> Tensor:
     """Rotations [views, 3, 3] -> unit quaternions wxyz [views, 4].
 

@@ -39,6 +39,8 @@ _TINY_CROSS_VIEW = replace(_TINY, cross_view_channels=16)
 # million of EfficientNet-Lite0. All other parts are those of _TINY_CROSS_VIEW, so that its weights are a start. One in
 # twenty of its scenes has four views; in use, groups of three are better.
 _LITE = replace(_TINY_CROSS_VIEW, photo=PhotoConfig(channels=_TINY.vit.dim))
+# With scales and rotations in the surface's frame. No other tensor differs, so that weights of _LITE are a start.
+_LITE_SURFACE = replace(_LITE, surface_frame=True)
 
 PRESETS = {
     "idesplat-re10k": IDESplatConfig(),
@@ -47,4 +49,5 @@ PRESETS = {
     "idesplat-tiny": _TINY,
     "idesplat-tiny-cross-view": _TINY_CROSS_VIEW,
     "idesplat-lite": _LITE,
+    "idesplat-lite-surface": _LITE_SURFACE,
 }
