@@ -379,16 +379,15 @@ def _free_form_hit(
 def _form(waves: np.ndarray, forms: np.ndarray, solid: int, x: float, y: float, z: float) -> float:
     """The implicit function of a free-form solid at a point of the unit frame, negative inside.
 
-    f = |p| - 1 + sum a (1 + p(kx x + ky y + kz z + phase)) over waves (kx, kz, phase, a, ky), p as in `_height`; the
+    f = |p| - 1 + sum a (1 + p(kx x + ky y + kz z + phase)) over waves (kx, kz, phase, a, ky), p as in `_wave_sum`; the
     norm |p| is (1 - s) |p|_2 + s |p|_4 for the squareness s: a ball at 0, a rounded cube at 1.
     """
     xx, yy, zz = x * x, y * y, z * z
     square = forms[solid, 0]
     value = (1.0 - square) * np.sqrt(xx + yy + zz) + square * np.sqrt(np.sqrt(xx * xx + yy * yy + zz * zz)) - 1.0
     for wave in range(WAVES):
-        turn = _space_turn(waves, solid, wave, x, y, z)
-        value += waves[solid, wave, 3] * (1.0 + 8.0 * turn * (1.0 - 2.0 * abs(turn)))
-    return value
+        value += waves[solid, wave, 3]
+    return value + _wave_sum(waves, solid, x, y, z)
 
 
 @_inlined()
@@ -399,20 +398,8 @@ def _form_slope(
     xx, yy, zz = x * x, y * y, z * z
     by_ball = (1.0 - forms[solid, 0]) / np.sqrt(xx + yy + zz)
     by_cube = forms[solid, 0] / (xx * xx + yy * yy + zz * zz) ** 0.75
-    by_x, by_y, by_z = x * (by_ball + by_cube * xx), y * (by_ball + by_cube * yy), z * (by_ball + by_cube * zz)
-    for wave in range(WAVES):
-        turn = _space_turn(waves, solid, wave, x, y, z)
-        slope = waves[solid, wave, 3] * 8.0 * (1.0 - 4.0 * abs(turn))
-        by_x, by_z = by_x + slope * waves[solid, wave, 0], by_z + slope * waves[solid, wave, 1]
-        by_y += slope * waves[solid, wave, 4]
-    return by_x, by_y, by_z
-
-
-@_inlined()
-def _space_turn(waves: np.ndarray, solid: int, wave: int, x: float, y: float, z: float) -> float:
-    """The phase of one wave of a free-form solid at a point, in periods, from -1/2 to 1/2."""
-    turn = waves[solid, wave, 0] * x + waves[solid, wave, 4] * y + waves[solid, wave, 1] * z + waves[solid, wave, 2]
-    return turn - np.floor(turn + 0.5)
+    by_x, by_y, by_z = _wave_slope(waves, solid, x, y, z)
+    return by_x + x * (by_ball + by_cube * xx), by_y + y * (by_ball + by_cube * yy), by_z + z * (by_ball + by_cube * zz)
 
 
 @_inlined()
@@ -448,32 +435,39 @@ def _height_hit(
 
 @_inlined()
 def _height(waves: np.ndarray, solid: int, x: float, z: float) -> float:
-    """The surface's y at (x, z) of the unit frame: the sum of a p(kx x + kz z + phase) over waves (kx, kz, phase, a).
+    """The surface's y at (x, z) of the unit frame."""
+    return _wave_sum(waves, solid, x, 0.0, z)
+
+
+@_inlined()
+def _wave_sum(waves: np.ndarray, solid: int, x: float, y: float, z: float) -> float:
+    """The sum of a p(kx x + ky y + kz z + phase) over waves (kx, kz, phase, a, ky); ky is 0 for a height field.
 
     p has period 1 and values from -1 to 1. It is a sine made of parabolas, which takes less time.
     """
-    y = 0.0
+    value = 0.0
     for wave in range(WAVES):
-        turn = _turn(waves, solid, wave, x, z)
-        y += waves[solid, wave, 3] * 8.0 * turn * (1.0 - 2.0 * abs(turn))
-    return y
+        turn = _turn(waves, solid, wave, x, y, z)
+        value += waves[solid, wave, 3] * 8.0 * turn * (1.0 - 2.0 * abs(turn))
+    return value
 
 
 @_inlined()
-def _height_slope(waves: np.ndarray, solid: int, x: float, z: float) -> tuple[float, float]:
-    """The derivatives of `_height` by x and z."""
-    by_x, by_z = 0.0, 0.0
+def _wave_slope(waves: np.ndarray, solid: int, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """The derivatives of `_wave_sum` by x, y and z."""
+    by_x, by_y, by_z = 0.0, 0.0, 0.0
     for wave in range(WAVES):
-        turn = _turn(waves, solid, wave, x, z)
+        turn = _turn(waves, solid, wave, x, y, z)
         slope = waves[solid, wave, 3] * 8.0 * (1.0 - 4.0 * abs(turn))
         by_x, by_z = by_x + slope * waves[solid, wave, 0], by_z + slope * waves[solid, wave, 1]
-    return by_x, by_z
+        by_y += slope * waves[solid, wave, 4]
+    return by_x, by_y, by_z
 
 
 @_inlined()
-def _turn(waves: np.ndarray, solid: int, wave: int, x: float, z: float) -> float:
-    """The phase of one wave at (x, z), in periods, from -1/2 to 1/2."""
-    turn = waves[solid, wave, 0] * x + waves[solid, wave, 1] * z + waves[solid, wave, 2]
+def _turn(waves: np.ndarray, solid: int, wave: int, x: float, y: float, z: float) -> float:
+    """The phase of one wave at a point, in periods, from -1/2 to 1/2."""
+    turn = waves[solid, wave, 0] * x + waves[solid, wave, 4] * y + waves[solid, wave, 1] * z + waves[solid, wave, 2]
     return turn - np.floor(turn + 0.5)
 
 
@@ -514,7 +508,7 @@ def _face(scene: Scene, solid: int, ux: float, uy: float, uz: float) -> tuple[in
     elif shape == ELLIPSOID and solid == 0:
         return SKY_FACE, nx, ny, nz
     elif shape == HEIGHT_FIELD and max(abs(ux), abs(uy), abs(uz)) < 1.0 - ON_SURFACE:
-        by_x, by_z = _height_slope(scene.waves, solid, ux, uz)
+        by_x, _, by_z = _wave_slope(scene.waves, solid, ux, 0.0, uz)
         nx, ny, nz = by_x / scene.halves[solid, 0], -1.0 / scene.halves[solid, 1], by_z / scene.halves[solid, 2]
         return 2, nx, ny, nz
     elif shape in (BOX, HEIGHT_FIELD):

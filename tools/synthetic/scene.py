@@ -20,7 +20,7 @@ class Scene(NamedTuple):
     halves: np.ndarray  # [solids, 3], half extents along the local axes
     cut_shapes: np.ndarray  # [solids] int64, of what is cut out: BOX, ELLIPSOID, CYLINDER or UNCUT
     cuts: np.ndarray  # [solids, 3, 4], from the solid's unit frame to that of what is cut out: `cuts @ (x, y, z, 1)`
-    waves: np.ndarray  # [solids, WAVES, 5], of height fields and free-form solids (`_height`, `_form` in raycast.py)
+    waves: np.ndarray  # [solids, WAVES, 5], of height fields and free-form solids (`_wave_sum`, `_form` in raycast.py)
     forms: np.ndarray  # [solids, 2], of free-form solids: squareness, and upper bound of the slope of `_form`
     materials: np.ndarray  # [solids, 6] int64, of the faces -x, +x, -y, +y, -z, +z
     textures: np.ndarray  # [materials] int64, index of a texture

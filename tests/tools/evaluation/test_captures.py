@@ -3,7 +3,6 @@
 import hashlib
 import json
 import shutil
-import subprocess
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -14,7 +13,6 @@ import numpy as np
 import pytest
 from conftest import run_command
 from idesplat import Predictor, read_cameras
-from idesplat.runtime.cameras.camera import Camera
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.reconstruction.steps import make_plan
 from idesplat.runtime.splats.filtering import FilterOptions, filter_gaussians
@@ -26,11 +24,11 @@ from idesplat.tools.evaluation.captures import capture as captures
 from idesplat.tools.evaluation.captures import checkouts, choose, spoiled
 from idesplat.tools.evaluation.captures.capture import CaptureImages, parse_view_counts, read_captures
 from idesplat.tools.evaluation.captures.checkouts import extract, fetch_checkout, find_checkout, list_folder
-from idesplat.tools.evaluation.captures.choose import as_json, camera_entries
 from idesplat.tools.evaluation.captures.scores import CaptureEvaluator, Scene
 from idesplat.tools.evaluation.cli import main
 from idesplat.tools.evaluation.metrics import HIGHEST_PSNR, fit_exposure, psnr
 from idesplat.tools.evaluation.novel_views import render_target
+from one_capture import git, list_one_capture
 
 FROZEN = "7499431c77fc0ba0ed42c9999332d3d174ee2f662c1a1cc5606d8749d488e4ad"
 TRAINED_ON = {"vork/maryRose", "alicevision/dataset_buddha"}
@@ -38,12 +36,6 @@ KINDS = {"room", "object", "facade", "vegetation", "aerial"}
 REPOSITORY, FOLDER = "someone/photos", "some/images"
 NAMES = [f"{index:03}.png" for index in range(5)]
 Capsys = pytest.CaptureFixture[str]
-
-
-def git(folder: Path, *arguments: str) -> str:
-    author = ("-c", "user.name=a", "-c", "user.email=a@example.com", "-c", "commit.gpgsign=false")
-    done = subprocess.run(["git", "-C", folder, *author, *arguments], check=True, capture_output=True, text=True)
-    return done.stdout.strip()
 
 
 @pytest.fixture(scope="module")
@@ -63,19 +55,12 @@ def repository(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[P
 @pytest.fixture
 def capture_file(scene: Path, repository: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A file with one capture, the scene: three views with two held-out frames between, and one triple."""
-    cameras = [
-        Camera(Path(camera.name).name, camera.width, camera.height, camera.K, camera.extrinsics)
-        for camera in read_cameras(scene / "transforms.json")
-    ]
-    entry = {
-        **{"name": "room", "kind": "room", "content": "a room", "licence": "CC0", "repository": REPOSITORY},
-        **{"commit": repository[1], "folder": FOLDER, "cameras": "transforms.json", "epipolar_px": 0.1},
-        **camera_entries(cameras),
+    fields = {
+        **{"repository": REPOSITORY, "commit": repository[1], "folder": FOLDER, "epipolar_px": 0.1},
         **{"triples": [["000.png", "004.png", "002.png"]], "views": NAMES[::2], "between": NAMES[1::2]},
     }
     path = tmp_path / "captures.json"
-    path.write_text(as_json([entry]))
-    monkeypatch.setattr(captures, "CAPTURES_FILE", path)
+    list_one_capture(path, scene, fields, monkeypatch)
     return path
 
 

@@ -1,41 +1,31 @@
 """Validation on real captures in training: what is logged, and which folders are refused."""
 
 import shutil
-import subprocess
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from idesplat.model.checkpoint import load_checkpoint
-from idesplat.runtime.cameras.camera import Camera
-from idesplat.runtime.cameras.io import read_cameras
 from idesplat.runtime.errors import InputError
 from idesplat.runtime.inference.normalization import SceneNormalization
 from idesplat.runtime.splats.gaussians import Gaussians
 from idesplat.runtime.views.depth_range import DepthRange
 from idesplat.tools.evaluation import metrics
-from idesplat.tools.evaluation.captures import capture as captures
 from idesplat.tools.evaluation.captures.capture import CaptureImages, read_captures
-from idesplat.tools.evaluation.captures.choose import as_json, camera_entries
 from idesplat.tools.evaluation.novel_views import render_target
 from idesplat.tools.training import trainer
 from idesplat.tools.training.capture_validation import check_not_trained_on
 from idesplat.tools.training.options import Objective, Resources
 from idesplat.tools.training.run_files import CHECKPOINT, LOG
 from idesplat.tools.training.trainer import CAPTURES_PSNR, Trainer
+from one_capture import git, list_one_capture
 from test_train import SETTINGS, SMALL, logged, one_thread, refused
 
 __all__ = ["one_thread"]  # a fixture
 TWO_STEPS = replace(SETTINGS, steps=2, batch=1)
 TRIPLE = ["000.png", "004.png", "002.png"]
 NEAR_FAR = 1.5, 12.0
-
-
-def git(folder: Path, *arguments: str) -> str:
-    author = ("-c", "user.name=a", "-c", "user.email=a@example.com", "-c", "commit.gpgsign=false")
-    done = subprocess.run(["git", "-C", folder, *author, *arguments], check=True, capture_output=True, text=True)
-    return done.stdout.strip()
 
 
 @pytest.fixture
@@ -47,19 +37,11 @@ def checkouts(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> P
     git(root, "init", "--quiet")
     git(root, "add", ".")
     git(root, "commit", "--quiet", "--message", "images")
-    cameras = [
-        Camera(Path(c.name).name, c.width, c.height, c.K, c.extrinsics, depth_range=NEAR_FAR)
-        for c in read_cameras(scene / "transforms.json")
-    ]
-    entry = {
-        **{"name": "room", "kind": "room", "content": "a room", "licence": "CC0", "repository": "someone/photos"},
-        **{"commit": git(root, "rev-parse", "HEAD"), "folder": "images", "cameras": "transforms.json"},
-        **camera_entries(cameras),
+    fields = {
+        **{"repository": "someone/photos", "commit": git(root, "rev-parse", "HEAD"), "folder": "images"},
         **{"triples": [TRIPLE], "views": TRIPLE[:2], "between": TRIPLE[2:]},
     }
-    path = tmp_path / "captures.json"
-    path.write_text(as_json([entry]))
-    monkeypatch.setattr(captures, "CAPTURES_FILE", path)
+    list_one_capture(tmp_path / "captures.json", scene, fields, monkeypatch, NEAR_FAR)
     return folder
 
 
