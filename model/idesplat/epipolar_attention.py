@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from ..common.gather_attention import GatherAttention, pixel_table
-from ..common.layers import ConvFFN, repeat_views, static_dim, to_map, to_tokens
+from ..common.layers import ConvFFN, MapLayerNorm, repeat_views, static_dim, to_map, to_tokens
 from ..common.unet import CostRegulariser
 from .config import DPBUConfig, IDESplatConfig
 
@@ -38,13 +38,13 @@ class EpipolarAttention(nn.Module):
         self.score_position = nn.Parameter(torch.zeros(candidates))
         for position in (self.key_position, self.value_position, self.score_position):
             nn.init.trunc_normal_(position, std=0.02)
-        self.norm1 = nn.LayerNorm(channels)
+        self.norm1 = MapLayerNorm(channels)
         self.q_proj = nn.Linear(channels, channels)
         self.k_proj = nn.Linear(channels, channels)
         self.v_proj = nn.Linear(channels, channels)
         self.regulariser = CostRegulariser(candidates + 1, candidates, unit.unet)
         self.proj = nn.Linear(channels, channels)
-        self.norm2 = nn.LayerNorm(channels)
+        self.norm2 = MapLayerNorm(channels)
         self.ffn = ConvFFN(channels, network.ffn_ratio, network.ffn_kernel)
 
     def forward(
@@ -58,8 +58,7 @@ class EpipolarAttention(nn.Module):
         """
         views, _, height, width = features.shape
         neighbours = rows.shape[0] // views
-        tokens = to_tokens(features)
-        normed = self.norm1(tokens)
+        normed = to_tokens(self.norm1(features))
         queries = repeat_views(self.q_proj(normed) * self.scale, neighbours)
         scores = self.gather_attention.gathered_dot(
             queries, pixel_table(self.k_proj(normed)), rows
@@ -82,6 +81,6 @@ class EpipolarAttention(nn.Module):
             probability, pixel_table(self.v_proj(normed)), rows
         )  # [pairs, h * w, channels]
         gathered = gathered + (probability * self.value_position[:, None]).sum(1)[..., None]
-        tokens = tokens + self.proj(gathered.reshape(views, neighbours, -1, static_dim(gathered.shape[2])).mean(1))
-        tokens = tokens + self.ffn(self.norm2(tokens), height, width)
-        return to_map(tokens, height, width), probability
+        gathered = gathered.reshape(views, neighbours, -1, static_dim(gathered.shape[2])).mean(1)
+        features = features + to_map(self.proj(gathered), height, width)
+        return features + self.ffn(self.norm2(features)), probability

@@ -62,9 +62,9 @@ def _run_in_float32(module: nn.Module) -> None:
     method = module.forward
 
     @wraps(method)
-    def in_float32(tokens: Tensor, *arguments: Any) -> Tensor:
-        with torch.autocast(tokens.device.type, enabled=False):
-            return method(tokens.float(), *arguments)
+    def in_float32(maps: Tensor, *arguments: Any) -> Tensor:
+        with torch.autocast(maps.device.type, enabled=False):
+            return method(maps.float(), *arguments)
 
     module.forward = in_float32
 
