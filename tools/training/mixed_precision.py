@@ -62,9 +62,9 @@ def _run_in_float32(module: nn.Module) -> None:
     method = module.forward
 
     @wraps(method)
-    def in_float32(maps: Tensor, *arguments: Any) -> Tensor:
+    def in_float32(maps: Tensor) -> Tensor:
         with torch.autocast(maps.device.type, enabled=False):
-            return method(maps.float(), *arguments)
+            return method(maps.float())
 
     module.forward = in_float32
 
