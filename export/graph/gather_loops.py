@@ -20,6 +20,8 @@ from ...model.common.gather_attention import GatherAttention, gathered_dot, gath
 
 # With fewer values than this to gather a pixel, the loop costs more than it saves.
 FEW = 256
+# Candidates of all pixels that are gathered at a time then. One at a time takes as much memory, and more nodes.
+CANDIDATES_AT_A_TIME = 2
 # While a network is traced, each operation is one node of this domain, defined by the functions below.
 DOMAIN = "idesplat"
 # What both operations share: rows [pairs, candidates, h * w], table [rows, channels] and `by_pixel` [pairs, h * w, ...]
@@ -66,13 +68,13 @@ GATHERED_WEIGHTED_SUM = """gathered_weighted_sum <step> (probability, table, row
 def chunked(network: nn.Module) -> Iterator[None]:
     """Within this context, a network's gather attention is traced as custom nodes, for `lower_custom_ops`.
 
-    Where few values are gathered a pixel, it is traced as it is, with all candidates at once.
+    Where few values are gathered a pixel, it is traced as it is, with a few candidates of all pixels at a time.
     """
     modules = [part for part in network.modules() if isinstance(part, GatherAttention)]
     for part in modules:
         if part.gathers < FEW:
-            part.gathered_dot = partial(gathered_dot, chunk=FEW)
-            part.gathered_weighted_sum = partial(gathered_weighted_sum, chunk=FEW)
+            part.gathered_dot = partial(gathered_dot, chunk=CANDIDATES_AT_A_TIME)
+            part.gathered_weighted_sum = partial(gathered_weighted_sum, chunk=CANDIDATES_AT_A_TIME)
         else:
             part.gathered_dot = partial(_GatheredDot.apply, part.block)
             part.gathered_weighted_sum = partial(_GatheredWeightedSum.apply, part.block)

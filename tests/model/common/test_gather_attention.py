@@ -4,7 +4,7 @@ import numpy as np
 import onnx
 import onnxruntime
 import torch
-from idesplat.export.graph.gather_loops import FEW, chunked
+from idesplat.export.graph.gather_loops import CANDIDATES_AT_A_TIME, FEW, chunked
 from idesplat.export.graph.subgraph import names_read
 from idesplat.model.common import gather_attention as gathered
 from idesplat.model.common.gather_attention import GatherAttention
@@ -77,8 +77,17 @@ def test_the_networks_own_are_put_back() -> None:
     )
 
 
-def test_few_numbers_are_gathered_at_once() -> None:
+def test_few_numbers_are_gathered_a_few_candidates_of_all_pixels_at_a_time() -> None:
     attention = GatherAttention(FEW - 1, BLOCK)
+    queries, weights, table, rows = random_tensors()
     with chunked(attention):
-        assert attention.gathered_dot.func is gathered.gathered_dot
-        assert attention.gathered_dot.keywords == {"chunk": FEW}
+        for operation, own in (
+            (attention.gathered_dot, gathered.gathered_dot),
+            (attention.gathered_weighted_sum, gathered.gathered_weighted_sum),
+        ):
+            assert operation.func is own
+            assert operation.keywords == {"chunk": CANDIDATES_AT_A_TIME}
+        scores = attention.gathered_dot(queries, table, rows)
+        sums = attention.gathered_weighted_sum(weights, table, rows)
+    torch.testing.assert_close(scores, (table[rows.long()] * queries[:, None]).sum(-1))
+    torch.testing.assert_close(sums, (table[rows.long()] * weights[..., None]).sum(1))
