@@ -21,7 +21,7 @@ import onnxruntime
 from ..system.cache_folder import cache_folder
 from ..system.files import open_regular, remove_abandoned_folders, scratch_folder
 
-LAYOUT = 1
+LAYOUT = 2
 SUFFIX = ".onnx"
 KEY_LENGTH = 32  # hexadecimal digits
 # Larger models run so long that a second or two of optimisation do not matter, and would displace others.
