@@ -72,6 +72,7 @@ static void run(const fs::path& model, const fs::path& folder, int64_t views, in
 
   Ort::Env env(ORT_LOGGING_LEVEL_WARNING, "idesplat");
   Ort::SessionOptions options;
+  options.AddConfigEntry("session.x64quantprecision", "1");  // int8 is wrong on some CPUs without it
   Ort::Session session(env, model.c_str(), options);
 
   const auto memory = Ort::MemoryInfo::CreateCpu(OrtArenaAllocator, OrtMemTypeDefault);

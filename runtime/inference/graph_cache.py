@@ -21,6 +21,7 @@ import onnxruntime
 from ..system.cache_folder import cache_folder
 from ..system.files import open_regular, remove_abandoned_folders, scratch_folder
 
+# Counts up with how entries are named, and with the session options that change what ONNX Runtime optimises.
 LAYOUT = 2
 SUFFIX = ".onnx"
 KEY_LENGTH = 32  # hexadecimal digits
