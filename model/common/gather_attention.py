@@ -9,6 +9,7 @@ These are the sparse matrix products of the released CUDA extension, as standard
 """
 
 from collections.abc import Callable
+from functools import reduce
 
 import torch
 import torch.nn.functional as F
@@ -47,9 +48,8 @@ def gathered_dot(queries: Tensor, table: Tensor, rows: Tensor, chunk: int = CHUN
     candidates = static_dim(rows.shape[1])
     if candidates <= chunk:
         return (F.embedding(rows, table) * queries).sum(-1)
-    starts = range(0, candidates, chunk)
-    scores = [(F.embedding(rows[:, start : start + chunk], table) * queries).sum(-1) for start in starts]
-    return torch.cat(scores, dim=1)
+    parts = _chunks(rows, chunk)
+    return torch.cat([(F.embedding(rows.index_select(1, part), table) * queries).sum(-1) for part in parts], dim=1)
 
 
 def gathered_weighted_sum(probability: Tensor, table: Tensor, rows: Tensor, chunk: int = CHUNK) -> Tensor:
@@ -58,8 +58,16 @@ def gathered_weighted_sum(probability: Tensor, table: Tensor, rows: Tensor, chun
     candidates = static_dim(rows.shape[1])
     if candidates <= chunk:
         return (F.embedding(rows, table) * probability).sum(1)
-    total = torch.zeros_like(probability[:, 0])
-    for start in range(0, candidates, chunk):
-        part = slice(start, start + chunk)
-        total = total + (F.embedding(rows[:, part], table) * probability[:, part]).sum(1)
-    return total
+    parts = _chunks(rows, chunk)
+    sums = [
+        (F.embedding(rows.index_select(1, part), table) * probability.index_select(1, part)).sum(1) for part in parts
+    ]
+    return reduce(torch.add, sums)
+
+
+def _chunks(rows: Tensor, chunk: int) -> tuple[Tensor, ...]:
+    """The candidates' indices, a few at a time.
+
+    Selected by index, not sliced: ONNX Runtime makes one Split of such slices, and WebGPU has none of integers.
+    """
+    return torch.arange(static_dim(rows.shape[1]), device=rows.device).split(chunk)
