@@ -32,7 +32,7 @@ TITLES = {
 DECIMALS = {"psnr": 2, "psnr_covisible": 2}
 DEFAULT_DECIMALS = 3
 METHODS = {MODEL: "model", NEAREST: "nearest", ORACLE_PLANE: "oracle plane", ORACLE_DEPTH: "oracle depth"}
-WIDTH = 130  # columns, where the output is no terminal
+WIDTH = 150  # columns, where the output is no terminal
 
 
 def print_views(results: Sequence[Result]) -> None:

@@ -24,7 +24,8 @@ from idesplat.tools.evaluation.captures import capture as captures
 from idesplat.tools.evaluation.captures import checkouts, choose, spoiled
 from idesplat.tools.evaluation.captures.capture import CaptureImages, parse_view_counts, read_captures
 from idesplat.tools.evaluation.captures.checkouts import extract, fetch_checkout, find_checkout, list_folder
-from idesplat.tools.evaluation.captures.scores import CaptureEvaluator, Scene
+from idesplat.tools.evaluation.captures.scores import CaptureEvaluator, Scene, input_psnr
+from idesplat.tools.evaluation.cases import PosedImages
 from idesplat.tools.evaluation.cli import main
 from idesplat.tools.evaluation.metrics import HIGHEST_PSNR, fit_exposure, psnr
 from idesplat.tools.evaluation.novel_views import render_target
@@ -298,6 +299,20 @@ def test_a_render_is_compared_in_the_mean_exposure_of_the_two_views_around() -> 
     scene = Scene(gaussian, exposure, 0.0)
     white = np.ones((2, 2, 3))
     np.testing.assert_allclose(scene.in_exposure_of(white, [1, 2]), (0.5 + 0.25) / 2)
+
+
+def test_input_views_are_compared_in_the_common_exposure_and_each_in_its_own() -> None:
+    # A grey wall, 0.5, before two cameras at one place. The second photograph is half as bright: its correction is 2.
+    exposure = Exposure(np.array([[1.0] * 3, [2.0] * 3]), np.zeros((2, 3)))
+    one = np.ones((1, 1), np.float32)
+    wall = Gaussians(one * [[0, 0, 5]], one * [[99] * 3], one * [[1, 0, 0, 0]], one[0], np.zeros((1, 1, 3), np.float32))
+    images = np.ones((2, 3, 4, 4), np.float32) * np.float32([0.5, 0.25])[:, None, None, None]
+    poses, K = np.stack([np.eye(4)] * 2), np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
+    context = PosedImages(["0", "1"], images, poses, np.stack([K] * 2), np.ones((2, 4, 4), bool))
+    common, own = input_psnr(Scene(wall, exposure, 0.0), context)
+    alone = psnr(render_target(wall, context, 0).rgb, context.image(0), context.valid[0])
+    assert own > alone > 30
+    assert common == pytest.approx((alone - 20 * np.log10(0.25)) / 2, abs=0.2)
 
 
 def test_exposure_is_compensated_unless_it_is_switched_off(

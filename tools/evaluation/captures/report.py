@@ -12,7 +12,7 @@ from ..metrics import LITE0, LPIPS
 from ..novel_views import MODEL, NEAREST, ORACLE_PLANE, Scores
 from ..report import describe, print_table, write_json
 from .capture import PAIR
-from .scores import INTERPOLATED, PAIRS, CaptureScores, mean_of_captures
+from .scores import INTERPOLATED, OWN_EXPOSURE, PAIRS, CaptureScores, mean_of_captures
 
 if TYPE_CHECKING:
     from ..evaluate import CaptureEvaluation
@@ -32,6 +32,7 @@ COLUMNS: tuple[Column, ...] = (
     ("from the\ntwo around", PAIRS, "psnr"),
     ("exposure\ninterpolated", PAIRS, INTERPOLATED),
     ("input\nviews", MODEL, "input_psnr"),
+    ("own\nexposure", MODEL, OWN_EXPOSURE),
 )
 DECIMALS = {"ssim": 3, LPIPS: 3, LITE0: 3}
 

@@ -25,6 +25,7 @@ from ..novel_views import MODEL, NEAREST, ORACLE_PLANE, Scores, comparison_strip
 from .capture import PAIR, Capture, CaptureImages
 
 INTERPOLATED = "psnr_interpolated_exposure"
+OWN_EXPOSURE = "input_psnr_own_exposure"
 PAIRS = "pairs"  # method: the model given the two views around each held-out frame
 
 Show = Callable[[str, np.ndarray], None]
@@ -61,12 +62,14 @@ class TargetScores:
 class CaseScores:
     """One prediction: its context, the held-out frames, and its context frames rendered from all its Gaussians.
 
+    input_psnr: of context frames in the Gaussians' common exposure. input_psnr_own_exposure: of each in its own.
     left_out: frames of the window that are not in the context, since the checks of images find a defect.
     """
 
     context: list[str]
     targets: list[TargetScores]
     input_psnr: float
+    input_psnr_own_exposure: float
     seconds: float
     left_out: list[str] = field(default_factory=list)
 
@@ -80,7 +83,7 @@ class CaptureScores:
     cases: dict[int, list[CaseScores]] = field(default_factory=dict)
 
     def mean(self, count: int) -> Scores:
-        """The mean over the held-out frames by method and metric, and of `input_psnr` over the cases."""
+        """The mean over the held-out frames by method and metric, and of the input views' PSNR over the cases."""
         cases = self.cases[count]
         targets = [target.scores for case in cases for target in case.targets]
         means = {
@@ -88,6 +91,7 @@ class CaptureScores:
             for method, metrics in targets[0].items()
         }
         means[MODEL]["input_psnr"] = float(np.mean([case.input_psnr for case in cases]))
+        means[MODEL][OWN_EXPOSURE] = float(np.mean([case.input_psnr_own_exposure for case in cases]))
         return means
 
 
@@ -171,7 +175,7 @@ class CaptureEvaluator:
         if show is not None:
             show(_strip_name(case, 0), comparison_strip(truth, valid, rendering, plane))
         targets = [TargetScores(case.targets.names[0], scores)]
-        return CaseScores(case.context.names, targets, _input_psnr(scene.gaussians, case), scene.seconds)
+        return CaseScores(case.context.names, targets, *input_psnr(scene, case.context), scene.seconds)
 
     def _window(
         self, case: EvalCase, around: Sequence[Sequence[int]], pairs: dict[str, Scores], show: Show | None
@@ -191,7 +195,7 @@ class CaptureEvaluator:
             targets.append(TargetScores(name, scores))
             if show is not None:
                 show(_strip_name(case, index), comparison_strip(truth, valid, rendering, None))
-        return CaseScores(case.context.names, targets, _input_psnr(scene.gaussians, case), scene.seconds)
+        return CaseScores(case.context.names, targets, *input_psnr(scene, case.context), scene.seconds)
 
     def _measure_scene(
         self, scene: Scene, image: np.ndarray, case: EvalCase, index: int, around: Sequence[int]
@@ -219,14 +223,14 @@ def mean_of_captures(results: Sequence[CaptureScores], count: int) -> Scores:
     }
 
 
-def _input_psnr(gaussians: Gaussians, case: EvalCase) -> float:
-    """The mean PSNR of the context frames rendered from all Gaussians."""
-    context = case.context
-    values = [
-        psnr(render_target(gaussians, context, view).rgb, context.image(view), context.valid[view])
-        for view in range(len(context))
-    ]
-    return float(np.mean(values))
+def input_psnr(scene: Scene, context: PosedImages) -> tuple[float, float]:
+    """The mean PSNR of the context frames rendered from all Gaussians: in their exposure, and each in its own."""
+    common, own = [], []
+    for view in range(len(context)):
+        image = render_target(scene.gaussians, context, view).rgb
+        common.append(psnr(image, context.image(view), context.valid[view]))
+        own.append(psnr(scene.in_exposure_of(image, [view]), context.image(view), context.valid[view]))
+    return float(np.mean(common)), float(np.mean(own))
 
 
 def _view_batch(context: PosedImages) -> ViewBatch:
