@@ -58,11 +58,11 @@ def gathered_weighted_sum(probability: Tensor, table: Tensor, rows: Tensor, chun
     candidates = static_dim(rows.shape[1])
     if candidates <= chunk:
         return (F.embedding(rows, table) * probability).sum(1)
-    parts = _chunks(rows, chunk)
-    sums = [
-        (F.embedding(rows.index_select(1, part), table) * probability.index_select(1, part)).sum(1) for part in parts
-    ]
-    return reduce(torch.add, sums)
+    products = (
+        (F.embedding(rows.index_select(1, part), table) * probability.index_select(1, part)).sum(1)
+        for part in _chunks(rows, chunk)
+    )
+    return reduce(torch.add, products)
 
 
 def _chunks(rows: Tensor, chunk: int) -> tuple[Tensor, ...]:
