@@ -21,6 +21,11 @@ from .bounds import check_max_gaussians
 from .many_views import voting_views
 from .quality import PRESETS, Preset, Quality, RefinementLimit, default_quality, parse_refine
 from .stereo import correct_depths
+from .view_colors import fit_view_colors
+
+# Views whose Gaussians of one surface are kept. Refinement takes less time with few of them, and gives better views;
+# without it, each view is best shown by its own.
+REFINED_COPIES, UNREFINED_COPIES = 2, 6
 
 
 @dataclass(frozen=True)
@@ -37,10 +42,14 @@ class Plan:
     gaussians: bool
 
     @property
+    def refines(self) -> bool:
+        """Whether the refinement has any steps."""
+        return bool(self.limit.steps if self.limit else self.preset.steps_per_added_view)
+
+    @property
     def copy_side(self) -> int:
         """The longer side of the images to refine on; 0 where there is nothing to do."""
-        steps = self.limit.steps if self.limit else self.preset.steps_per_added_view
-        return self.preset.copy_side if self.gaussians and (steps or self.max_gaussians) else 0
+        return self.preset.copy_side if self.gaussians and (self.refines or self.max_gaussians) else 0
 
     @property
     def corrects_depths(self) -> bool:
@@ -80,20 +89,22 @@ def make_plan(
         raise InputError(f"--quality {quality}: expected one of {', '.join(Quality)}")
     check_max_gaussians(max_gaussians)
     preset = PRESETS[Quality(quality or default_quality(model.path))]
-    if preset.fuse and model.metadata.gaussians:
-        filters = replace(filters, remove_contradicted=True, remove_redundant=True, close_holes=True)
     limit = parse_refine(refine) if refine is not None else None
-    return Plan(preset, filters, limit, max_gaussians, model.metadata.gaussians)
+    plan = Plan(preset, filters, limit, max_gaussians, model.metadata.gaussians)
+    if not plan.corrects_depths:
+        return plan
+    copies = REFINED_COPIES if plan.refines else UNREFINED_COPIES
+    return replace(plan, filters=replace(filters, remove_contradicted=True, remove_redundant=copies, close_holes=True))
 
 
 def fuse(prediction: Prediction, views: ViewBatch, span: DepthRange, plan: Plan) -> Stepped:
-    """The prediction with its depths corrected, if the plan fuses views, and the Gaussians that its filters keep."""
+    """The Gaussians that the plan's filters keep; if it fuses views, with depths and colours that suit all of them."""
     if not (plan.corrects_depths or plan.filters.enabled):
         return Stepped(prediction)
     started = time.perf_counter()
     voters = voting_views(views, span)
     if plan.corrects_depths:
-        prediction = correct_depths(prediction, views, voters)
+        prediction = fit_view_colors(correct_depths(prediction, views, voters), views, voters)
     kept, removed = filter_gaussians(
         prediction.need_gaussians(),
         prediction.depth,

@@ -33,7 +33,7 @@ class FilterOptions:
     remove_contradicted: those that other views see through, with three views or more, and with four those that most
         disagree with; see `fusion.find_contradicted`.
     merge_duplicates: merge Gaussians that different views predict at the same point of a surface into one.
-    remove_redundant: those of surfaces that two other views show; see `fusion.find_redundant`.
+    remove_redundant: those of surfaces that so many other views show, 0 for none; see `fusion.find_redundant`.
     close_holes: fit shapes to the surface, and continue background behind depth edges; see `holes.close_holes`.
 
     Raises InputError if a value is out of range.
@@ -45,7 +45,7 @@ class FilterOptions:
     min_consistency: float = 0.0
     remove_contradicted: bool = False
     merge_duplicates: bool = False
-    remove_redundant: bool = False
+    remove_redundant: int = 0
     close_holes: bool = False
 
     def __post_init__(self) -> None:
@@ -106,7 +106,7 @@ def filter_gaussians(
                 gaussians = merge_gaussians(gaussians, representative)
                 kept &= representative == np.arange(kept.size).reshape(kept.shape)
             case "remove_redundant":
-                kept &= ~find_redundant(surfaces, kept)
+                kept &= ~find_redundant(surfaces, kept, options.remove_redundant)
             case "close_holes":
                 continue  # it adds some: after all others
         removed[name] = before - int(kept.sum())
@@ -127,7 +127,7 @@ def describe_removed(removed: dict[str, int], left: int) -> str:
         "min_consistency": "not confirmed by other views",
         "remove_contradicted": "that other views see through",
         "merge_duplicates": "merged into another view's",
-        "remove_redundant": "that two other views show as well",
+        "remove_redundant": "that enough other views show as well",
         "free_space": "right before the cameras",
     }
     counts = ", ".join(f"{count:,} {words[name]}" for name, count in removed.items())

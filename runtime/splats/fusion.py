@@ -2,6 +2,7 @@
 
 A point is supported by a view whose depth and colour agree with it, and contradicted by a view that sees a surface
 behind it, or one of another colour at its place: that view looks through the point. What only one view sees is neither.
+A surface of the point's colour counts little, because a wrong point before it shows little.
 Only a surface that is supported itself speaks against a point, so that a wrong depth map does not remove a right one.
 So where all views disagree, none contradicts; a point that most of them disagree with is removed as well, unless its
 own view would then have a hole there, and it hides the surfaces of few others.
@@ -23,11 +24,11 @@ ROUNDS = 3  # a point that is removed no longer contradicts others
 # A point is contradicted if the votes against it exceed VOTE_RATIO (MIN_SUPPORT + support).
 MIN_SUPPORT = 0.5
 VOTE_RATIO = 0.7
+SAME_COLOR = 0.25  # of a vote, of a view that sees a surface of the point's colour behind it: little harm is done
 MIN_CONSISTENCY = 0.5  # share of the neighbours whose surface is at a point or behind it that must agree with it
 MANY_HIDDEN = 6  # views whose surfaces a point hides, from where it does more harm than the hole that it leaves
 MIN_MAJORITY_VIEWS = 4  # from which on most views can outvote one; of three, two that disagree may both be wrong
 MIN_VOTING_VIEWS = 3  # with two views, a contradiction does not tell which of both is wrong
-COPIES = 2  # views whose points of one surface are kept
 COARSER = 1.5  # times the depth, from where a surface is sampled too coarsely to stand for another copy
 
 
@@ -40,44 +41,43 @@ def find_contradicted(surfaces: Surfaces) -> np.ndarray:
     s, support = surfaces, _votes(surfaces, _support)
     kept = np.ones(support.shape, bool)
     for _ in range(ROUNDS):
-        kept = _votes(s, _against, kept & (support > 0)) <= VOTE_RATIO * (support + MIN_SUPPORT)
+        kept = _votes(s, _against, kept & (support > 0), SAME_COLOR) <= VOTE_RATIO * (support + MIN_SUPPORT)
     if len(s.depth) < MIN_MAJORITY_VIEWS:
         return ~kept
     consistency = multi_view_consistency(s.points, s.depth, s.extrinsics, s.intrinsics, s.neighbors)
     agreed = kept & (consistency >= MIN_CONSISTENCY)
-    hides_many = _votes(s, _against, np.ones_like(kept)) >= MANY_HIDDEN
+    hides_many = _votes(s, _against, np.ones_like(kept), 1.0) >= MANY_HIDDEN
     return ~kept | (~agreed & (hides_many | _covered(s, agreed)))
 
 
-def _votes(surfaces: Surfaces, kernel: Callable[..., None], *voters: np.ndarray) -> np.ndarray:
+def _votes(surfaces: Surfaces, kernel: Callable[..., None], *options: np.ndarray | float) -> np.ndarray:
     """The neighbours' votes for or against each point, as `_support` or `_against` counts them, float32.
 
-    [views, height, width]. voters: for `_against`, the points that are solid, bool of the same shape.
+    [views, height, width]. options: for `_against`, its `solid` and `same_color`.
     """
     s, votes = surfaces, np.zeros(surfaces.depth.shape, np.float32)
     colors, least, most = s.color_ranges
 
     def count(view: int) -> None:
         of_view = s.points[view], colors[view], s.neighbors[view]
-        kernel(*of_view, s.depth, s.viewmats, s.Ks, least, most, *voters, votes[view])
+        kernel(*of_view, s.depth, s.viewmats, s.Ks, least, most, *options, votes[view])
 
     map_in_threads(count, len(votes))
     return votes
 
 
-def find_redundant(surfaces: Surfaces, kept: np.ndarray) -> np.ndarray:
-    """The points of surfaces that COPIES views nearer to the middle show as finely, bool [views, height, width].
+def find_redundant(surfaces: Surfaces, kept: np.ndarray, copies: int) -> np.ndarray:
+    """The points of surfaces that `copies` views nearer to the middle show as finely, bool [views, height, width].
 
-    kept: the points that take part, bool [views, height, width]. More copies than that add nothing to the rendered
-    views but time and memory, and small disagreements.
+    kept: the points that take part, bool [views, height, width]. Copies cost time and memory.
     """
     left, order = kept.copy(), _middle_first(surfaces.extrinsics)
     place = np.argsort(order)
     for view in order.tolist():
         neighbors = surfaces.neighbors[view]
         earlier = neighbors[place[neighbors] < place[view]]
-        if len(earlier) >= COPIES:
-            _thin(surfaces.points[view], earlier, surfaces.depth, surfaces.viewmats, surfaces.Ks, left, view)
+        if len(earlier) >= copies:
+            _thin(surfaces.points[view], earlier, surfaces.depth, surfaces.viewmats, surfaces.Ks, left, view, copies)
     return kept & ~left
 
 
@@ -150,20 +150,25 @@ def _against(
     least: np.ndarray,
     most: np.ndarray,
     solid: np.ndarray,  # [views, height, width]
+    same_color: float,
     against: np.ndarray,  # [height, width]
 ) -> None:
-    """Count the neighbours that see a solid surface behind each point of a view, or of another colour at its place."""
+    """Count the neighbours that see a solid surface behind each point of a view, or of another colour at its place.
+
+    A surface behind it of the point's own colour counts `same_color`.
+    """
     height, width = against.shape
     for row in range(height):
         for column in range(width):
-            votes = 0
+            votes = 0.0
             for view in neighbors:
                 z, y, x = project_to_pixel(points[row, column], viewmats[view], Ks[view], height, width)
                 if y < 0 or not solid[view, y, x] or z >= depth[view, y, x] * (1 + DEPTH_TOLERANCE):
                     continue
-                before = z < depth[view, y, x] * (1 - DEPTH_TOLERANCE)
-                if before or not color_agrees(colors[row, column], least[view, y, x], most[view, y, x]):
+                if not color_agrees(colors[row, column], least[view, y, x], most[view, y, x]):
                     votes += 1
+                elif z < depth[view, y, x] * (1 - DEPTH_TOLERANCE):
+                    votes += same_color
             against[row, column] = votes
 
 
@@ -176,16 +181,17 @@ def _thin(
     Ks: np.ndarray,
     left: np.ndarray,  # [views, height, width]
     own: int,
+    copies: int,
 ) -> None:
-    """Clear the points of the view `own` of which COPIES earlier views have a point left, about as finely sampled."""
+    """Clear the points of the view `own` of which `copies` earlier views have a point left, about as finely sampled."""
     height, width = points.shape[:2]
     for row in range(height):
         for column in range(width):
-            copies = 0
+            found = 0
             for view in earlier:
                 z, y, x = project_to_pixel(points[row, column], viewmats[view], Ks[view], height, width)
                 if y < 0 or not left[view, y, x] or z > COARSER * depth[own, row, column]:
                     continue
-                copies += abs(z - depth[view, y, x]) <= DEPTH_TOLERANCE * depth[view, y, x]
-            if copies >= COPIES:
+                found += abs(z - depth[view, y, x]) <= DEPTH_TOLERANCE * depth[view, y, x]
+            if found >= copies:
                 left[own, row, column] = False

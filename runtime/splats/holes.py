@@ -6,7 +6,7 @@ from ..system.threads import map_in_threads
 from .backdrop import make_backdrop
 from .background import continue_background
 from .gaussians import Gaussians
-from .surface_shape import fit_to_surface, mix_views
+from .surface_shape import ask_neighbors, fit_to_surface, mix_views
 from .surfaces import Surfaces
 
 
@@ -30,9 +30,10 @@ def close_view(
     """
     pixels = kept[view].size
     own = gaussians.select(np.arange(pixels * view, pixels * (view + 1)))
-    fitted, shared = fit_to_surface(own, surfaces, kept, view)
+    votes = ask_neighbors(surfaces, kept, view)
+    fitted = fit_to_surface(own, surfaces, votes, kept, view)
     return (
-        mix_views(fitted, shared, len(kept)).select(kept[view].ravel()),
+        mix_views(fitted, votes, len(kept)).select(kept[view].ravel()),
         continue_background(fitted, surfaces, kept, view),
         make_backdrop(own, surfaces, kept, view),
     )

@@ -12,11 +12,11 @@ which moves nothing across the rays: its image in its own view stays, and a ball
 What other views see through keeps its shape, as wrong surfaces should not hide right ones.
 
 Where two views show one surface, their nearly opaque Gaussians compete: the layer that is nearer by a hair hides the
-other. With less opacity their colours mix. They also sample it twice as densely as one view does, so that smaller ones
-close it as well, and mix less of what their depths make disagree.
+other. With less opacity their colours mix. The more views show it, the more densely they sample it, so that less
+opaque and smaller Gaussians close it as well, and mix less of what their depths make disagree.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,41 +26,69 @@ from .gaussians import Gaussians
 from .merging import covariances, ellipsoids
 from .surfaces import Surfaces, project_to_pixel
 
-MIN_SMALLER_VIEWS = 3  # the network was trained to predict Gaussians of two views that mix
-# What a Gaussian of a surface that another view shows, too, keeps of its opacity and its scales.
-SHARED_OPACITY, SHARED_SCALE = 0.75, 1.0
-SMALLER_OPACITY, SMALLER_SCALE = 0.9, 0.75  # with MIN_SMALLER_VIEWS
+PAIR = 2  # views; the network was trained to predict Gaussians of two views that mix
+SHARED_OPACITY = 0.75  # of two views, what a Gaussian of a surface that both show keeps of its opacity
+# With more views: 1 - the light that opaque Gaussians of all views of a surface let through together, and what a
+# Gaussian of such a surface keeps of its scales.
+TOTAL_OPACITY, SHARED_SCALE = 0.99, 0.75
 
 
-def fit_to_surface(
-    gaussians: Gaussians, surfaces: Surfaces, kept: np.ndarray, view: int
-) -> tuple[Gaussians, np.ndarray]:
-    """The Gaussians of a view, one for each pixel, in shapes that close the surface, and which are shared.
+@dataclass(frozen=True, eq=False)
+class Votes:
+    """What the kept surfaces of the neighbours say of each Gaussian of a view, [height * width] each.
 
-    Those of surfaces that no more neighbours contradict than confirm are sheared along their rays, except where a
-    neighbour has denser samples of the surface. Those that a neighbour confirms are shared, bool [height * width].
-    kept: the pixels whose Gaussians are kept, bool [views, height, width].
+    confirmed: views whose depth agrees. seen_through: views that see a surface behind it. denser: whether a view that
+    confirms it samples the surface more densely.
     """
-    spacings, (stretched, shared) = surfaces.spacings, np.zeros((2, *kept[view].shape), bool)
-    _ask_neighbors(
-        surfaces.points[view], spacings[view], surfaces.neighbors[view], surfaces.depth, spacings,
-        kept, surfaces.viewmats, surfaces.Ks, stretched, shared,
+
+    confirmed: np.ndarray
+    seen_through: np.ndarray
+    denser: np.ndarray
+
+
+def ask_neighbors(surfaces: Surfaces, kept: np.ndarray, view: int) -> Votes:
+    """The votes on the Gaussians of a view; kept: the pixels whose Gaussians are kept, bool [views, height, width]."""
+    s, spacings = surfaces, surfaces.spacings
+    confirmed, seen_through = np.zeros((2, *kept[view].shape), np.int32)
+    denser = np.zeros(kept[view].shape, bool)
+    _count(
+        s.points[view], spacings[view], s.neighbors[view], s.depth, spacings, kept, s.viewmats, s.Ks,
+        confirmed, seen_through, denser,
     )  # fmt: skip
-    members = np.flatnonzero(stretched & kept[view])
+    return Votes(confirmed.ravel(), seen_through.ravel(), denser.ravel())
+
+
+def fit_to_surface(gaussians: Gaussians, surfaces: Surfaces, votes: Votes, kept: np.ndarray, view: int) -> Gaussians:
+    """The Gaussians of a view, one for each pixel, in shapes that close the surface.
+
+    Those of surfaces that no more neighbours see through than confirm are sheared along their rays, except where a
+    neighbour has denser samples of the surface. kept: the pixels whose Gaussians are kept, bool [views, height, width].
+    """
+    stretched = (votes.confirmed >= votes.seen_through) & ~votes.denser
+    members = np.flatnonzero(stretched & kept[view].ravel())
     shear = _shears(surfaces, view, members)
     scales, quats = gaussians.scales.copy(), gaussians.quats.copy()
     scales[members], quats[members] = ellipsoids(shear @ covariances(gaussians, members) @ shear.swapaxes(1, 2))
-    return replace(gaussians, scales=scales, quats=quats), shared.ravel()
+    return replace(gaussians, scales=scales, quats=quats)
 
 
-def mix_views(gaussians: Gaussians, shared: np.ndarray, views: int) -> Gaussians:
-    """The Gaussians with the shared ones less opaque and, with MIN_SMALLER_VIEWS, smaller; shared: bool [gaussians]."""
-    smaller = views >= MIN_SMALLER_VIEWS
-    opacity, scale = (SMALLER_OPACITY, SMALLER_SCALE) if smaller else (SHARED_OPACITY, SHARED_SCALE)
-    scales, opacities = gaussians.scales.copy(), gaussians.opacities.copy()
-    opacities[shared] *= np.float32(opacity)
-    scales[shared] *= np.float32(scale)
-    return replace(gaussians, scales=scales, opacities=opacities)
+def mix_views(gaussians: Gaussians, votes: Votes, views: int) -> Gaussians:
+    """The Gaussians of a view with those of shared surfaces less opaque and, with more than two views, smaller.
+
+    With more than two views, those that neighbours see through lose opacity, too: the share of the votes against them.
+    """
+    shared = votes.confirmed > 0
+    if views == PAIR:
+        opacities = np.where(shared, SHARED_OPACITY, 1)
+        return replace(gaussians, opacities=gaussians.opacities * opacities.astype(np.float32))
+    copies = votes.confirmed + 1
+    opacities = np.where(shared, 1 - (1 - TOTAL_OPACITY) ** (1 / copies), 1) * copies / (copies + votes.seen_through)
+    scales = np.where(shared, SHARED_SCALE, 1)[:, None].astype(np.float32)
+    return replace(
+        gaussians,
+        scales=gaussians.scales * scales,
+        opacities=gaussians.opacities * opacities.astype(np.float32),
+    )
 
 
 def _shears(surfaces: Surfaces, view: int, members: np.ndarray) -> np.ndarray:
@@ -72,7 +100,7 @@ def _shears(surfaces: Surfaces, view: int, members: np.ndarray) -> np.ndarray:
 
 
 @compiled()
-def _ask_neighbors(
+def _count(
     points: np.ndarray,  # [height, width, 3]
     spacing: np.ndarray,  # [height, width]
     neighbors: np.ndarray,
@@ -81,23 +109,21 @@ def _ask_neighbors(
     kept: np.ndarray,  # [views, height, width]
     viewmats: np.ndarray,
     Ks: np.ndarray,
-    stretched: np.ndarray,  # [height, width]
-    shared: np.ndarray,  # [height, width]
+    confirmed: np.ndarray,  # [height, width]
+    seen_through: np.ndarray,  # [height, width]
+    denser: np.ndarray,  # [height, width]
 ) -> None:
-    """Find the pixels whose Gaussians are sheared, and those that a neighbour confirms: see `fit_to_surface`."""
-    height, width = stretched.shape
+    """Fill what `Votes` holds."""
+    height, width = denser.shape
     for row in range(height):
         for column in range(width):
-            confirmed, against, denser = 0, 0, False
             for view in neighbors:
                 z, y, x = project_to_pixel(points[row, column], viewmats[view], Ks[view], height, width)
                 if y < 0 or not kept[view, y, x]:
                     continue
                 surface = depth[view, y, x]
                 if z < surface * (1 - DEPTH_TOLERANCE):
-                    against += 1
+                    seen_through[row, column] += 1
                 elif z <= surface * (1 + DEPTH_TOLERANCE):
-                    confirmed += 1
-                    denser = denser or spacings[view, y, x] < spacing[row, column]
-            stretched[row, column] = confirmed >= against and not denser
-            shared[row, column] = confirmed > 0
+                    confirmed[row, column] += 1
+                    denser[row, column] |= spacings[view, y, x] < spacing[row, column]

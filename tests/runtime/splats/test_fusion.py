@@ -85,6 +85,18 @@ def test_a_point_of_another_colour_than_the_surface_at_its_place_goes() -> None:
     assert not found.any()
 
 
+@pytest.mark.parametrize(("colour", "goes"), [(0.3, False), (0.9, True)], ids=["of the wall", "another"])
+def test_one_view_that_sees_through_a_point_removes_it_only_if_it_has_another_colour(colour: float, goes: bool) -> None:
+    """The third view supports the wall that the second sees behind the patch, and does not see the patch itself."""
+    depth, extrinsics = wall(3), cameras(3)
+    depth[0][PATCH] = WALL / 2
+    extrinsics[2, 0, 3] = -1.5
+    images = np.full((3, 3, HEIGHT, WIDTH), 0.3, np.float32)
+    images[0, :, PATCH[0], PATCH[1]] = colour
+    views = Surfaces(unproject(depth, extrinsics), depth, extrinsics, np.tile(K, (3, 1, 1)), images)
+    assert (find_contradicted(views)[0][PATCH].mean() > 0.9) == goes
+
+
 def test_colours_within_fine_texture_agree() -> None:
     """Each view samples stripes of one pixel elsewhere."""
     images = np.full((4, 3, HEIGHT, WIDTH), 0.1, np.float32)
@@ -95,7 +107,7 @@ def test_colours_within_fine_texture_agree() -> None:
 def test_the_two_views_in_the_middle_stay_and_of_the_others_what_these_do_not_see() -> None:
     depth = wall(4)
     everything = np.ones(depth.shape, bool)
-    redundant = find_redundant(surfaces(depth), everything)
+    redundant = find_redundant(surfaces(depth), everything, 2)
     assert not redundant[1:3].any()
     shift = int(0.3 * WIDTH * float(K[0, 0]) / WALL) + 1  # pixels from view to view
     assert redundant[0, :, 2 * shift :].all() and redundant[3, :, : WIDTH - 2 * shift].all()
@@ -105,7 +117,7 @@ def test_the_two_views_in_the_middle_stay_and_of_the_others_what_these_do_not_se
 def test_what_is_removed_counts_as_no_copy() -> None:
     kept = np.ones((4, HEIGHT, WIDTH), bool)
     kept[1] = False
-    redundant = find_redundant(surfaces(wall(4)), kept)
+    redundant = find_redundant(surfaces(wall(4)), kept, 2)
     assert not redundant[:3].any() and redundant[3].any()
 
 
@@ -148,4 +160,4 @@ def test_a_nearer_view_of_a_surface_stays() -> None:
     depth = wall(3)
     depth[:2] = 2 * WALL
     found = Surfaces(unproject(depth, extrinsics), depth, extrinsics, np.tile(K, (3, 1, 1)))
-    assert not find_redundant(found, np.ones(depth.shape, bool)).any()
+    assert not find_redundant(found, np.ones(depth.shape, bool), 2).any()

@@ -239,3 +239,19 @@ def test_a_surface_of_one_view_stays_opaque(second: float | None) -> None:
         surfaces.depth[1] = second
     after, _, _ = close_view(before, surfaces, np.ones((views, SIZE, SIZE), bool), 0)
     np.testing.assert_array_equal(after.opacities, before.opacities[: SIZE * SIZE])
+
+
+@pytest.mark.parametrize("views", [3, 4, 6])
+def test_all_views_of_a_surface_together_let_a_hundredth_of_the_light_through(views: int) -> None:
+    before, surfaces = pixel_sized(np.concatenate([slanted(0)[None]] * views), shifted(*[0] * views))
+    before.opacities[:] = 1
+    after, _, _ = close_view(before, surfaces, np.ones((views, SIZE, SIZE), bool), 0)
+    np.testing.assert_allclose((1 - after.opacities) ** views, 0.01, rtol=1e-4)
+
+
+def test_of_many_views_one_that_sees_through_a_gaussian_takes_its_share_of_the_opacity() -> None:
+    """A view alone against one keeps half of it; with two views it does not tell which of them is wrong."""
+    before, surfaces = pixel_sized(np.concatenate([slanted(0)[None]] * 3), shifted(0, 0, 100))
+    surfaces.depth[1] = 20 * DISTANCE
+    after, _, _ = close_view(before, surfaces, np.ones((3, SIZE, SIZE), bool), 0)
+    np.testing.assert_allclose(after.opacities, before.opacities[: SIZE * SIZE] / 2)
