@@ -127,7 +127,7 @@ def describe_removed(removed: dict[str, int], left: int) -> str:
         "min_consistency": "not confirmed by other views",
         "remove_contradicted": "that other views see through",
         "merge_duplicates": "merged into another view's",
-        "remove_redundant": "that enough other views show as well",
+        "remove_redundant": "that other views show as well",
         "free_space": "right before the cameras",
     }
     counts = ", ".join(f"{count:,} {words[name]}" for name, count in removed.items())
