@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from ..errors import InputError
 from ..inference.model_files import ModelFiles
@@ -23,9 +24,10 @@ from .quality import PRESETS, Preset, Quality, RefinementLimit, default_quality,
 from .stereo import correct_depths
 from .view_colors import fit_view_colors
 
-# Views whose Gaussians of one surface are kept. Refinement takes less time with few of them, and gives better views;
-# without it, each view is best shown by its own.
-REFINED_COPIES, UNREFINED_COPIES = 2, 6
+# What fusion removes. Refinement takes less time with two copies of a surface, and gives better views. Without it, each
+# view is best shown by its own Gaussians, and a wrong one before a surface of its own colour is better than a hole.
+REFINED: dict[str, Any] = {"remove_contradicted": 1.0, "remove_redundant": 2}
+UNREFINED: dict[str, Any] = {"remove_contradicted": 0.25, "remove_redundant": 6}
 
 
 @dataclass(frozen=True)
@@ -93,8 +95,8 @@ def make_plan(
     plan = Plan(preset, filters, limit, max_gaussians, model.metadata.gaussians)
     if not plan.corrects_depths:
         return plan
-    copies = REFINED_COPIES if plan.refines else UNREFINED_COPIES
-    return replace(plan, filters=replace(filters, remove_contradicted=True, remove_redundant=copies, close_holes=True))
+    removed = REFINED if plan.refines else UNREFINED
+    return replace(plan, filters=replace(filters, **removed, close_holes=True))
 
 
 def fuse(prediction: Prediction, views: ViewBatch, span: DepthRange, plan: Plan) -> Stepped:

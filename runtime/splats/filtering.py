@@ -31,7 +31,7 @@ class FilterOptions:
     min_consistency: those of pixels whose depth is confirmed by a smaller fraction of the other views, 0 to 1; see
         `geometry.consistency.multi_view_consistency`.
     remove_contradicted: those that other views see through, with three views or more, and with four those that most
-        disagree with; see `fusion.find_contradicted`.
+        disagree with: its `same_color`, 0 for none; see `fusion.find_contradicted`.
     merge_duplicates: merge Gaussians that different views predict at the same point of a surface into one.
     remove_redundant: those of surfaces that so many other views show, 0 for none; see `fusion.find_redundant`.
     close_holes: fit shapes to the surface, and continue background behind depth edges; see `holes.close_holes`.
@@ -43,7 +43,7 @@ class FilterOptions:
     crop_border: int = 0
     max_depth_jump: float = 0.0
     min_consistency: float = 0.0
-    remove_contradicted: bool = False
+    remove_contradicted: float = 0.0
     merge_duplicates: bool = False
     remove_redundant: int = 0
     close_holes: bool = False
@@ -100,7 +100,7 @@ def filter_gaussians(
                 kept &= multi_view_consistency(means, depth, extrinsics, intrinsics) >= options.min_consistency
             case "remove_contradicted":
                 if len(depth) >= MIN_VOTING_VIEWS:
-                    kept &= ~find_contradicted(surfaces)
+                    kept &= ~find_contradicted(surfaces, options.remove_contradicted)
             case "merge_duplicates":
                 representative = find_duplicates(means, depth, kept, extrinsics, intrinsics)
                 gaussians = merge_gaussians(gaussians, representative)

@@ -2,7 +2,7 @@
 
 A point is supported by a view whose depth and colour agree with it, and contradicted by a view that sees a surface
 behind it, or one of another colour at its place: that view looks through the point. What only one view sees is neither.
-A surface of the point's colour counts little, because a wrong point before it shows little.
+A wrong point before a surface of its own colour shows little, so that such a contradiction may count less.
 Only a surface that is supported itself speaks against a point, so that a wrong depth map does not remove a right one.
 So where all views disagree, none contradicts; a point that most of them disagree with is removed as well, unless its
 own view would then have a hole there, and it hides the surfaces of few others.
@@ -24,7 +24,6 @@ ROUNDS = 3  # a point that is removed no longer contradicts others
 # A point is contradicted if the votes against it exceed VOTE_RATIO (MIN_SUPPORT + support).
 MIN_SUPPORT = 0.5
 VOTE_RATIO = 0.7
-SAME_COLOR = 0.25  # of a vote, of a view that sees a surface of the point's colour behind it: little harm is done
 MIN_CONSISTENCY = 0.5  # share of the neighbours whose surface is at a point or behind it that must agree with it
 MANY_HIDDEN = 6  # views whose surfaces a point hides, from where it does more harm than the hole that it leaves
 MIN_MAJORITY_VIEWS = 4  # from which on most views can outvote one; of three, two that disagree may both be wrong
@@ -32,16 +31,17 @@ MIN_VOTING_VIEWS = 3  # with two views, a contradiction does not tell which of b
 COARSER = 1.5  # times the depth, from where a surface is sampled too coarsely to stand for another copy
 
 
-def find_contradicted(surfaces: Surfaces) -> np.ndarray:
+def find_contradicted(surfaces: Surfaces, same_color: float = 1.0) -> np.ndarray:
     """The points that other views see through, or most disagree with, bool [views, height, width].
 
+    same_color: the vote of a view that sees a surface of the point's own colour behind it; that of another view is 1.
     Those that most disagree with count only with MIN_MAJORITY_VIEWS, and where their view has no need of them: where
     points of the neighbours that are kept cover their pixel, or they hide the surfaces of MANY_HIDDEN views.
     """
     s, support = surfaces, _votes(surfaces, _support)
     kept = np.ones(support.shape, bool)
     for _ in range(ROUNDS):
-        kept = _votes(s, _against, kept & (support > 0), SAME_COLOR) <= VOTE_RATIO * (support + MIN_SUPPORT)
+        kept = _votes(s, _against, kept & (support > 0), same_color) <= VOTE_RATIO * (support + MIN_SUPPORT)
     if len(s.depth) < MIN_MAJORITY_VIEWS:
         return ~kept
     consistency = multi_view_consistency(s.points, s.depth, s.extrinsics, s.intrinsics, s.neighbors)

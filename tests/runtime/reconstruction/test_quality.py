@@ -45,6 +45,12 @@ def test_the_bundled_model_is_refined_by_default_and_others_are_left_as_they_pre
     assert plan("high", bundled=False).filters.remove_contradicted
 
 
+def test_more_copies_are_kept_and_less_is_removed_without_refinement() -> None:
+    refined, unrefined = plan("standard").filters, plan("standard", "0").filters
+    assert (refined.remove_redundant, unrefined.remove_redundant) == (2, 6)
+    assert refined.remove_contradicted > unrefined.remove_contradicted > 0
+
+
 def test_refine_overrides_the_quality() -> None:
     assert plan("standard", "0").copy_side == 0
     assert plan("fast", "40").refinement(2).steps == 40
