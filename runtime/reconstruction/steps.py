@@ -54,8 +54,8 @@ class Plan:
         return self.preset.copy_side if self.gaussians and (self.refines or self.max_gaussians) else 0
 
     @property
-    def corrects_depths(self) -> bool:
-        """Whether the views' depths are corrected by stereo matching between them."""
+    def fuses(self) -> bool:
+        """Whether depths and colours are made to suit all views, and what these do not confirm is removed."""
         return self.preset.fuse and self.gaussians
 
     def refinement(self, views: int) -> RefinementOptions:
@@ -93,7 +93,7 @@ def make_plan(
     preset = PRESETS[Quality(quality or default_quality(model.path))]
     limit = parse_refine(refine) if refine is not None else None
     plan = Plan(preset, filters, limit, max_gaussians, model.metadata.gaussians)
-    if not plan.corrects_depths:
+    if not plan.fuses:
         return plan
     removed = REFINED if plan.refines else UNREFINED
     return replace(plan, filters=replace(filters, **removed, close_holes=True))
@@ -101,11 +101,11 @@ def make_plan(
 
 def fuse(prediction: Prediction, views: ViewBatch, span: DepthRange, plan: Plan) -> Stepped:
     """The Gaussians that the plan's filters keep; if it fuses views, with depths and colours that suit all of them."""
-    if not (plan.corrects_depths or plan.filters.enabled):
+    if not (plan.fuses or plan.filters.enabled):
         return Stepped(prediction)
     started = time.perf_counter()
     voters = voting_views(views, span)
-    if plan.corrects_depths:
+    if plan.fuses:
         prediction = fit_view_colors(correct_depths(prediction, views, voters), views, voters)
     kept, removed = filter_gaussians(
         prediction.need_gaussians(),
@@ -146,7 +146,7 @@ def refine_prediction(
 
 def _clear_free_space(gaussians: Gaussians, prediction: Prediction, views: ViewBatch, plan: Plan) -> Gaussians:
     """Those that do not hang right before the cameras, if the plan fuses views; all, if that would leave none."""
-    if not plan.corrects_depths or len(views.names) < MIN_VOTING_VIEWS:
+    if not plan.fuses or len(views.names) < MIN_VOTING_VIEWS:
         return gaussians
     found = find_in_free_space(gaussians.means, prediction.depth, views.extrinsics, views.intrinsics)
     return gaussians if found.all() else gaussians.select(~found)

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from ..inference.predictor import Prediction
-from ..splats.surfaces import Surfaces, project_to_pixel
+from ..splats.surfaces import Surfaces, bilinear, project_to_pixel
 from ..system.compilation import compiled
 from ..system.threads import map_in_threads
 from ..views.batch import ViewBatch
@@ -140,17 +140,10 @@ def _sample(
             across = (from_pixels[0, 0] * x + from_pixels[0, 1] * y + from_pixels[0, 2]) * z + offset[0]
             down = (from_pixels[1, 0] * x + from_pixels[1, 1] * y + from_pixels[1, 2]) * z + offset[1]
             away = (from_pixels[2, 0] * x + from_pixels[2, 1] * y + from_pixels[2, 2]) * z + offset[2]
-            u, v = across / away - 0.5, down / away - 0.5
-            inside = away > 0 and 0 <= u < width - 1 and 0 <= v < height - 1
+            u, v = across / away, down / away
+            inside = away > 0 and 0.5 <= u < width - 0.5 and 0.5 <= v < height - 0.5
             seen[row, column] = inside
-            if not inside:
-                image[row, column] = 0
-                continue
-            left, top = int(u), int(v)
-            right, below = u - left, v - top
-            upper = source[top, left] * (1 - right) + source[top, left + 1] * right
-            lower = source[top + 1, left] * (1 - right) + source[top + 1, left + 1] * right
-            image[row, column] = upper * (1 - below) + lower * below
+            image[row, column] = bilinear(source, u, v) if inside else 0
 
 
 @compiled()

@@ -18,7 +18,7 @@ import numpy as np
 
 from ..geometry.sh import SH_0, SH_1
 from ..inference.predictor import Prediction
-from ..splats.surfaces import Surfaces, project_to_pixel
+from ..splats.surfaces import Surfaces, bilinear, project
 from ..system.compilation import compiled
 from ..system.threads import map_in_threads
 from ..views.batch import ViewBatch
@@ -42,34 +42,34 @@ def fit_view_colors(prediction: Prediction, views: ViewBatch, voters: list[np.nd
     gaussians = prediction.need_gaussians()
     points = gaussians.means.reshape(*prediction.depth.shape, 3)
     surfaces = Surfaces(points, prediction.depth, views.extrinsics, views.intrinsics, None, voters)
-    images = np.ascontiguousarray(views.images.transpose(0, 2, 3, 1), np.float32)
     unknowns = min(LINEAR, gaussians.sh.shape[1])
     sh = gaussians.sh.copy()
 
     def fit(view: int) -> None:
         pixels = prediction.depth[view].size
         own = slice(view * pixels, (view + 1) * pixels)
-        sh[own, :unknowns] += _changes(surfaces, images, view, unknowns)
+        sh[own, :unknowns] += _changes(surfaces, views.images, view, unknowns)
 
-    map_in_threads(fit, len(images))
+    map_in_threads(fit, len(views.names))
     return replace(prediction, gaussians=replace(gaussians, sh=sh))
 
 
 def _changes(surfaces: Surfaces, images: np.ndarray, view: int, unknowns: int) -> np.ndarray:
     """What is added to the SH of a view's Gaussians, float32 [pixels, unknowns, 3].
 
-    images: RGB, [views, height, width, 3]. unknowns: 1 for a alone, LINEAR for a and b.
+    images: RGB, [views, 3, height, width]. unknowns: 1 for a alone, LINEAR for a and b.
     """
-    s, pixels = surfaces, images[view, ..., 0].size
+    s, pixels = surfaces, surfaces.depth[view].size
     normal, right = np.zeros((pixels, LINEAR, LINEAR)), np.zeros((pixels, LINEAR, 3))
     centers = np.ascontiguousarray(s.extrinsics[:, :3, 3])
-    _collect(s.points[view], s.neighbors[view], s.depth, s.viewmats, s.Ks, centers, images, view, normal, right)
+    directions = s.points[view] - centers[view]
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    of_view = s.points[view], directions, images[view], s.neighbors[view]
+    _collect(*of_view, s.depth, s.viewmats, s.Ks, centers, images, normal, right)
     normal += np.diag([1, STIFFNESS, STIFFNESS, STIFFNESS])
     fitted = np.linalg.solve(normal[:, :unknowns, :unknowns], right[:, :unknowns])
     if unknowns == LINEAR:
-        own = s.points[view].reshape(-1, 3) - centers[view]
-        own /= np.linalg.norm(own, axis=1, keepdims=True)
-        fitted[:, 0] -= np.einsum("pa,pac->pc", own, fitted[:, 1:])
+        fitted[:, 0] -= np.einsum("pa,pac->pc", directions.reshape(-1, 3), fitted[:, 1:])
         fitted[:, 1:] = Y_1_SIGNS[:, None] * fitted[:, 1:][:, Y_1_AXES] / SH_1
     fitted[:, 0] /= SH_0
     return fitted.astype(np.float32)
@@ -78,62 +78,46 @@ def _changes(surfaces: Surfaces, images: np.ndarray, view: int, unknowns: int) -
 @compiled()
 def _collect(
     points: np.ndarray,  # [height, width, 3]
+    directions: np.ndarray,  # [height, width, 3], d_0
+    own: np.ndarray,  # [3, height, width]
     neighbors: np.ndarray,
     depth: np.ndarray,  # [views, height, width]
     viewmats: np.ndarray,
     Ks: np.ndarray,
     centers: np.ndarray,  # [views, 3]
-    images: np.ndarray,  # [views, height, width, 3]
-    own: int,
+    images: np.ndarray,  # [views, 3, height, width]
     normal: np.ndarray,  # [height * width, LINEAR, LINEAR]
     right: np.ndarray,  # [height * width, LINEAR, 3]
 ) -> None:
-    """Add up the normal equations for the Gaussians of the view `own`: a row for each neighbour that shows them."""
+    """Add up the normal equations for the Gaussians of a view: an equation for each neighbour that shows them."""
     height, width = points.shape[:2]
-    coefficients, difference = np.ones(LINEAR), np.empty(3)
+    coefficients, difference, ray = np.ones(LINEAR), np.empty(3), np.empty(3)
     for row in range(height):
         for column in range(width):
-            point, pixel = points[row, column], row * width + column
             for view in neighbors:
-                z, y, x = project_to_pixel(point, viewmats[view], Ks[view], height, width)
-                if y < 0 or abs(z - depth[view, y, x]) > DEPTH_TOLERANCE * depth[view, y, x]:
+                z, x, y = project(points[row, column], viewmats[view], Ks[view])
+                if z <= 0 or not (0 <= x < width and 0 <= y < height):
                     continue
-                _sample(point, viewmats[view], Ks[view], images[view], difference)
-                difference -= images[own, row, column]
+                surface = depth[view, int(y), int(x)]
+                if abs(z - surface) > DEPTH_TOLERANCE * surface:
+                    continue
+                for channel in range(3):
+                    difference[channel] = bilinear(images[view, channel], x, y) - own[channel, row, column]
                 if np.abs(difference).max() > COLOR_TOLERANCE:
                     continue
-                _turn(point, centers[view], centers[own], coefficients)
-                for one in range(LINEAR):
-                    for other in range(LINEAR):
-                        normal[pixel, one, other] += coefficients[one] * coefficients[other]
-                    for channel in range(3):
-                        right[pixel, one, channel] += coefficients[one] * difference[channel]
+                for axis in range(3):
+                    ray[axis] = points[row, column, axis] - centers[view, axis]
+                length = np.sqrt(ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2)
+                for axis in range(3):
+                    coefficients[1 + axis] = ray[axis] / length - directions[row, column, axis]
+                _add(coefficients, difference, normal[row * width + column], right[row * width + column])
 
 
 @compiled()
-def _turn(point: np.ndarray, center: np.ndarray, own: np.ndarray, coefficients: np.ndarray) -> None:
-    """Fill coefficients [1:] with d_v - d_0."""
-    distance, own_distance = 0.0, 0.0
-    for axis in range(3):
-        distance += (point[axis] - center[axis]) ** 2
-        own_distance += (point[axis] - own[axis]) ** 2
-    for axis in range(3):
-        direction, own_direction = point[axis] - center[axis], point[axis] - own[axis]
-        coefficients[1 + axis] = direction / np.sqrt(distance) - own_direction / np.sqrt(own_distance)
-
-
-@compiled()
-def _sample(point: np.ndarray, viewmat: np.ndarray, K: np.ndarray, image: np.ndarray, color: np.ndarray) -> None:
-    """Fill the colour [3] of an image [height, width, 3] at a point that lies in it, bilinear."""
-    height, width = image.shape[:2]
-    x = viewmat[0, 0] * point[0] + viewmat[0, 1] * point[1] + viewmat[0, 2] * point[2] + viewmat[0, 3]
-    y = viewmat[1, 0] * point[0] + viewmat[1, 1] * point[1] + viewmat[1, 2] * point[2] + viewmat[1, 3]
-    z = viewmat[2, 0] * point[0] + viewmat[2, 1] * point[1] + viewmat[2, 2] * point[2] + viewmat[2, 3]
-    u = min(max(K[0, 0] * x / z + K[0, 2] - 0.5, 0.0), width - 1.0)
-    v = min(max(K[1, 1] * y / z + K[1, 2] - 0.5, 0.0), height - 1.0)
-    left, top = min(int(u), width - 2), min(int(v), height - 2)
-    right, below = u - left, v - top
-    for channel in range(3):
-        upper = image[top, left, channel] * (1 - right) + image[top, left + 1, channel] * right
-        lower = image[top + 1, left, channel] * (1 - right) + image[top + 1, left + 1, channel] * right
-        color[channel] = upper * (1 - below) + lower * below
+def _add(coefficients: np.ndarray, difference: np.ndarray, normal: np.ndarray, right: np.ndarray) -> None:
+    """Add an equation, coefficients [LINEAR] times the unknowns is the difference [3], to the normal equations."""
+    for one in range(LINEAR):
+        for other in range(LINEAR):
+            normal[one, other] += coefficients[one] * coefficients[other]
+        for channel in range(3):
+            right[one, channel] += coefficients[one] * difference[channel]

@@ -1,42 +1,35 @@
 """Colours that follow the direction of view: what all views show of a surface, from where they show it."""
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from idesplat.runtime.geometry.sh import SH_0, sh_basis
 from idesplat.runtime.inference.predictor import Prediction
 from idesplat.runtime.reconstruction.view_colors import fit_view_colors
 from idesplat.runtime.splats.gaussians import Gaussians
-from idesplat.runtime.splats.points import unproject
 from idesplat.runtime.views.batch import ViewBatch
+from views_in_a_row import prediction_of, views_in_a_row
 
 SIZE, WALL = 16, 2.0
-INTRINSICS = np.array([[0.5, 0, 0.5], [0, 0.5, 0.5], [0, 0, 1]], np.float32)
+K = np.array([[8.0, 0, 8], [0, 8, 8], [0, 0, 1]])
 ALL_SEE = 0.9  # half the width of the part of the wall before the cameras that all of them see
 
 
-def cameras(*positions: float) -> np.ndarray:
-    """Side by side, looking at a wall, camera-to-world [views, 4, 4]."""
-    extrinsics = np.tile(np.eye(4), (len(positions), 1, 1))
-    extrinsics[:, 0, 3] = positions
-    return extrinsics
-
-
 def predicted(
-    images: np.ndarray, extrinsics: np.ndarray, coefficients: int, depth: np.ndarray | None = None
+    images: np.ndarray, positions: Sequence[float], coefficients: int, depth: np.ndarray | None = None
 ) -> tuple[Prediction, ViewBatch]:
-    """Gaussians with the colours of their views' images, RGB [views, 3, SIZE, SIZE], on a wall or at another depth."""
-    views = len(images)
-    depth = np.full((views, SIZE, SIZE), WALL, np.float32) if depth is None else depth
-    intrinsics = np.tile(INTRINSICS, (views, 1, 1))
-    means = unproject(depth, extrinsics, intrinsics).reshape(-1, 3).astype(np.float32)
-    sh = np.zeros((len(means), coefficients, 3), np.float32)
+    """Gaussians with the colours of their views' images, RGB [views, 3, SIZE, SIZE], on a wall or at another depth.
+
+    positions: of the cameras, side by side.
+    """
+    views = views_in_a_row(images, positions, K)
+    prediction = prediction_of(np.full((len(images), SIZE, SIZE), WALL) if depth is None else depth, views)
+    gaussians = prediction.need_gaussians()
+    sh = np.zeros((len(gaussians), coefficients, 3), np.float32)
     sh[:, 0] = (images.transpose(0, 2, 3, 1).reshape(-1, 3) - 0.5) / SH_0
-    ones = np.ones(len(means), np.float32)
-    gaussians = Gaussians(
-        means, np.full((len(means), 3), 0.1, np.float32), np.tile([1, 0, 0, 0], (len(means), 1)), ones, sh
-    )
-    names = [f"{view}.png" for view in range(views)]
-    return Prediction(depth, gaussians), ViewBatch(names, images, extrinsics, intrinsics, [])
+    return replace(prediction, gaussians=replace(gaussians, sh=sh)), views
 
 
 def fitted(prediction: Prediction, views: ViewBatch) -> Gaussians:
@@ -63,7 +56,7 @@ def common(gaussians: Gaussians, view: int) -> np.ndarray:
 
 def test_without_directions_each_view_takes_the_mean_of_what_all_show() -> None:
     """For the first view, a^2 + (a - 0.1)^2 + (a - 0.5)^2 is least at 0.2."""
-    gaussians = fitted(*predicted(plain(0.2, 0.3, 0.7), cameras(-0.1, 0.0, 0.1), 1))
+    gaussians = fitted(*predicted(plain(0.2, 0.3, 0.7), (-0.1, 0.0, 0.1), 1))
     for view in range(3):
         np.testing.assert_allclose(gaussians.colours[common(gaussians, view)], 0.4, atol=1e-5)
 
@@ -71,7 +64,7 @@ def test_without_directions_each_view_takes_the_mean_of_what_all_show() -> None:
 def test_a_shade_that_changes_with_the_direction_is_seen_from_each_view() -> None:
     """The wall is brighter from the right: every view's Gaussians show each camera nearly what its image shows."""
     positions, levels = (-0.9, -0.3, 0.3, 0.9), (0.35, 0.45, 0.55, 0.65)
-    before, views = predicted(plain(*levels), cameras(*positions), 4)
+    before, views = predicted(plain(*levels), positions, 4)
     after = fitted(before, views)
     for view in range(4):
         for position, level in zip(positions, levels, strict=True):
@@ -81,7 +74,7 @@ def test_a_shade_that_changes_with_the_direction_is_seen_from_each_view() -> Non
 
 @pytest.mark.parametrize("coefficients", [9, 16])
 def test_higher_degrees_stay(coefficients: int) -> None:
-    before, views = predicted(plain(0.2, 0.3, 0.7), cameras(-0.1, 0.0, 0.1), coefficients)
+    before, views = predicted(plain(0.2, 0.3, 0.7), (-0.1, 0.0, 0.1), coefficients)
     before.need_gaussians().sh[:, 4:] = 0.25
     after = fitted(before, views)
     assert (after.sh[:, 4:] == 0.25).all() and (after.sh[:, 1:4] != 0).any()
@@ -90,10 +83,10 @@ def test_higher_degrees_stay(coefficients: int) -> None:
 def test_what_lies_elsewhere_or_has_a_very_different_colour_does_not_count() -> None:
     depth = np.full((3, SIZE, SIZE), WALL, np.float32)
     depth[2] *= 1.2
-    before, views = predicted(plain(0.1, 0.9, 0.2), cameras(-0.1, 0.0, 0.1), 4, depth)
+    before, views = predicted(plain(0.1, 0.9, 0.2), (-0.1, 0.0, 0.1), 4, depth)
     np.testing.assert_array_equal(fitted(before, views).sh, before.need_gaussians().sh)
 
 
 def test_two_views_stay_as_they_are() -> None:
-    before, views = predicted(plain(0.2, 0.3), cameras(-0.1, 0.1), 4)
+    before, views = predicted(plain(0.2, 0.3), (-0.1, 0.1), 4)
     assert fitted(before, views) is before.need_gaussians()
