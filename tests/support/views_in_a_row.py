@@ -10,11 +10,17 @@ from idesplat.runtime.splats.points import unproject
 from idesplat.runtime.views.batch import ViewBatch
 
 
+def extrinsics_in_a_row(*positions: float) -> np.ndarray:
+    """Poses on the x axis, camera-to-world [cameras, 4, 4]."""
+    extrinsics = np.tile(np.eye(4), (len(positions), 1, 1))
+    extrinsics[:, 0, 3] = positions
+    return extrinsics
+
+
 def views_in_a_row(images: np.ndarray, positions: Sequence[float], K: np.ndarray) -> ViewBatch:
     """Views of images [views, 3, height, width] from positions on the x axis. K: of all, in pixels."""
     count, _, height, width = images.shape
-    extrinsics = np.tile(np.eye(4), (count, 1, 1))
-    extrinsics[:, 0, 3] = positions
+    extrinsics = extrinsics_in_a_row(*positions)
     intrinsics = np.tile((K / [[width], [height], [1]]).astype(np.float32), (count, 1, 1))
     names = [f"{view}.png" for view in range(count)]
     cameras = [Camera(name, width, height, K, pose) for name, pose in zip(names, extrinsics, strict=True)]

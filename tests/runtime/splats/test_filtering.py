@@ -16,17 +16,11 @@ from idesplat.runtime.splats.filtering import FilterOptions, describe_removed, f
 from idesplat.runtime.splats.gaussians import Gaussians
 from idesplat.runtime.splats.merging import merge_gaussians
 from idesplat.runtime.splats.points import points_from_depth
+from views_in_a_row import extrinsics_in_a_row
 
 HEIGHT, WIDTH = 12, 16
 ARRAYS = ("means", "scales", "quats", "opacities", "sh")
 INTRINSICS = np.tile(np.array([[1.0, 0, 0.5], [0, WIDTH / HEIGHT, 0.5], [0, 0, 1]]), (2, 1, 1))
-
-
-def poses(*shifts: float) -> np.ndarray:
-    """Cameras side by side that look along z."""
-    extrinsics = np.tile(np.eye(4), (len(shifts), 1, 1))
-    extrinsics[:, 0, 3] = shifts
-    return extrinsics
 
 
 def one_a_pixel(depth: np.ndarray, extrinsics: np.ndarray, opacity: float = 0.5) -> Gaussians:
@@ -53,29 +47,29 @@ def wall(distance: float = 2.0) -> np.ndarray:
 
 def test_nothing_is_asked_for_by_default() -> None:
     assert FilterOptions().enabled == []
-    gaussians = one_a_pixel(wall(), poses(0, 0.5))
+    gaussians = one_a_pixel(wall(), extrinsics_in_a_row(0, 0.5))
     filters = FilterOptions()
-    left, taken = filter_gaussians(gaussians, wall(), poses(0, 0.5), INTRINSICS, filters)
+    left, taken = filter_gaussians(gaussians, wall(), extrinsics_in_a_row(0, 0.5), INTRINSICS, filters)
     assert taken == {}
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(left, name), getattr(gaussians, name))
 
 
 def test_faint_gaussians() -> None:
-    gaussians = one_a_pixel(wall(), poses(0, 0.5))
+    gaussians = one_a_pixel(wall(), extrinsics_in_a_row(0, 0.5))
     gaussians.opacities[[3, 200]] = 0.04
     gaussians.opacities[7] = 0.05
     left, taken = filter_gaussians(
-        gaussians, wall(), poses(0, 0.5), INTRINSICS, FilterOptions(min_opacity=np.float32(0.05))
+        gaussians, wall(), extrinsics_in_a_row(0, 0.5), INTRINSICS, FilterOptions(min_opacity=np.float32(0.05))
     )
     assert taken == {"min_opacity": 2}
     assert sorted(set(range(2 * HEIGHT * WIDTH)) - set(numbers(left))) == [3, 200]
 
 
 def test_borders() -> None:
-    gaussians = one_a_pixel(wall(), poses(0, 0.5))
+    gaussians = one_a_pixel(wall(), extrinsics_in_a_row(0, 0.5))
     filters = FilterOptions(crop_border=2)
-    left, taken = filter_gaussians(gaussians, wall(), poses(0, 0.5), INTRINSICS, filters)
+    left, taken = filter_gaussians(gaussians, wall(), extrinsics_in_a_row(0, 0.5), INTRINSICS, filters)
     assert taken == {"crop_border": 2 * (HEIGHT * WIDTH - (HEIGHT - 4) * (WIDTH - 4))}
     rows, columns = np.divmod(np.array(numbers(left)) % (HEIGHT * WIDTH), WIDTH)
     assert (rows.min(), rows.max(), columns.min(), columns.max()) == (2, HEIGHT - 3, 2, WIDTH - 3)
@@ -90,7 +84,11 @@ def test_depth_edges() -> None:
     np.testing.assert_allclose(jumps[1, :, 7:9], 0.25, atol=1e-6)
     assert not jumps[1, :, :7].any() and not jumps[1, :, 9:].any()
     left, taken = filter_gaussians(
-        one_a_pixel(depth, poses(0, 0.5)), depth, poses(0, 0.5), INTRINSICS, FilterOptions(max_depth_jump=0.1)
+        one_a_pixel(depth, extrinsics_in_a_row(0, 0.5)),
+        depth,
+        extrinsics_in_a_row(0, 0.5),
+        INTRINSICS,
+        FilterOptions(max_depth_jump=0.1),
     )
     assert taken == {"max_depth_jump": 2 * HEIGHT}
     assert not {HEIGHT * WIDTH + 7, HEIGHT * WIDTH + 8} & set(numbers(left))
@@ -98,7 +96,7 @@ def test_depth_edges() -> None:
 
 def test_confidence_worked_by_hand() -> None:
     """Two cameras, .5 apart, before a wall at 2: what one sees at column c, the other sees 4 columns to the left."""
-    extrinsics = poses(0, 0.5)
+    extrinsics = extrinsics_in_a_row(0, 0.5)
     depth = wall()
     depth[0, 4:8, 8:12] = 1.0  # a board in the air, which the second camera would see: 8 columns to the left, at 0 to 3
     points = points_from_depth(depth, np.zeros((2, 3, HEIGHT, WIDTH)), extrinsics, INTRINSICS).positions
@@ -116,7 +114,7 @@ def test_confidence_worked_by_hand() -> None:
 
 
 def test_what_is_too_far_is_denied_by_what_sees_nearer() -> None:
-    extrinsics = poses(0, 0.5)
+    extrinsics = extrinsics_in_a_row(0, 0.5)
     depth = wall()
     depth[0, 4:8, 8:12] = 4.0  # a hole: the second camera's wall there stands where the first sees through
     points = points_from_depth(depth, np.zeros((2, 3, HEIGHT, WIDTH)), extrinsics, INTRINSICS).positions
@@ -132,7 +130,7 @@ def test_what_is_too_far_is_denied_by_what_sees_nearer() -> None:
 
 def test_the_same_surface_is_merged_once() -> None:
     """The second camera sees 12 of its 16 columns where the first does, pixel on pixel."""
-    extrinsics = poses(0, 0.5)
+    extrinsics = extrinsics_in_a_row(0, 0.5)
     gaussians = one_a_pixel(wall(), extrinsics, opacity=0.5)
     filters = FilterOptions(merge_duplicates=True)
     left, taken = filter_gaussians(gaussians, wall(), extrinsics, INTRINSICS, filters)
@@ -150,7 +148,7 @@ def test_the_same_surface_is_merged_once() -> None:
 
 
 def test_what_was_left_out_before_is_not_merged_into() -> None:
-    extrinsics = poses(0, 0.5)
+    extrinsics = extrinsics_in_a_row(0, 0.5)
     gaussians = one_a_pixel(wall(), extrinsics)
     gaussians.opacities[: HEIGHT * WIDTH] = 0.01
     left, taken = filter_gaussians(
@@ -214,7 +212,13 @@ def test_the_line_names_and_counts() -> None:
 )
 def test_what_cannot_be_asked_for(values: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        filter_gaussians(one_a_pixel(wall(), poses(0, 0.5)), wall(), poses(0, 0.5), INTRINSICS, FilterOptions(**values))
+        filter_gaussians(
+            one_a_pixel(wall(), extrinsics_in_a_row(0, 0.5)),
+            wall(),
+            extrinsics_in_a_row(0, 0.5),
+            INTRINSICS,
+            FilterOptions(**values),
+        )
 
 
 # ---- effect on PSNR
