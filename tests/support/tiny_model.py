@@ -8,6 +8,7 @@ import numpy as np
 import onnx.parser
 from idesplat.runtime.inference.metadata import METADATA_KEY, ModelMetadata
 from onnx import helper
+from views_in_a_row import extrinsics_in_a_row
 
 OWN = ModelMetadata(
     preset="tiny",
@@ -61,7 +62,6 @@ def write_model(path: Path, text: str = NETWORK, **changes: object) -> Path:
 def arrays(views: int = 2, height: int = 32, width: int = 48) -> dict[str, np.ndarray]:
     """Inputs of such a graph: images of noise, cameras side by side, normalized intrinsics."""
     images = np.random.default_rng(0).random((views, 3, height, width), np.float32)
-    extrinsics = np.tile(np.eye(4, dtype=np.float32), (views, 1, 1))
-    extrinsics[:, 0, 3] = np.arange(views)
+    extrinsics = extrinsics_in_a_row(*range(views)).astype(np.float32)
     K = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]], np.float32)
     return {"images": images, "extrinsics": extrinsics, "intrinsics": np.tile(K, (views, 1, 1))}

@@ -1,11 +1,11 @@
 """The choice among several predictions of a view, on a plane that five cameras see."""
 
 import numpy as np
-from idesplat.runtime.cameras.camera import Camera
 from idesplat.runtime.inference.predictor import Prediction
 from idesplat.runtime.reconstruction.agreement import WINDOW, Agreement
 from idesplat.runtime.splats.gaussians import Gaussians
 from idesplat.runtime.views.batch import ViewBatch
+from views_in_a_row import views_in_a_row
 
 VIEWS, HEIGHT, WIDTH = 5, 32, 48
 PLANE = 10.0
@@ -15,14 +15,9 @@ K = np.array([[WIDTH, 0, WIDTH / 2], [0, WIDTH, HEIGHT / 2], [0, 0, 1]])
 
 def plane_views(colors: np.ndarray | None = None) -> ViewBatch:
     """Cameras beside each other before the plane, of one colour each, [views, 3]; gray by default."""
-    extrinsics = np.tile(np.eye(4), (VIEWS, 1, 1))
-    extrinsics[:, 0, 3] = 0.3 * np.arange(VIEWS)
-    names = [f"{view}.png" for view in range(VIEWS)]
-    cameras = [Camera(name, WIDTH, HEIGHT, K, pose) for name, pose in zip(names, extrinsics, strict=True)]
     gray = np.full((VIEWS, 3), 0.5, np.float32)
     images = np.ones((VIEWS, 3, HEIGHT, WIDTH), np.float32) * (gray if colors is None else colors)[..., None, None]
-    intrinsics = np.tile(np.float32([[1, 0, 0.5], [0, WIDTH / HEIGHT, 0.5], [0, 0, 1]]), (VIEWS, 1, 1))
-    return ViewBatch(names, images, extrinsics, intrinsics, cameras)
+    return views_in_a_row(images, 0.3 * np.arange(VIEWS), K)
 
 
 def agreement(views: ViewBatch, neighbors: list[list[int]] | None = None) -> Agreement:

@@ -12,6 +12,7 @@ from idesplat.runtime.reconstruction import many_views
 from idesplat.runtime.splats.gaussians import Gaussians
 from idesplat.runtime.views.batch import ViewBatch
 from idesplat.runtime.views.depth_range import BASELINE, DepthRange
+from views_in_a_row import extrinsics_in_a_row
 
 HEIGHT, WIDTH = 4, 6
 SPAN = DepthRange(5.0, 20.0, "given")
@@ -21,8 +22,7 @@ K = np.array([[6.0, 0, 3], [0, 6.0, 2], [0, 0, 1]])
 def batch(count: int) -> ViewBatch:
     """Views along a line, in a mixed order, whose images have their number as their value."""
     numbers = np.random.default_rng(0).permutation(count)
-    extrinsics = np.tile(np.eye(4), (count, 1, 1))
-    extrinsics[:, 0, 3] = 0.8 * numbers
+    extrinsics = extrinsics_in_a_row(*(0.8 * numbers))
     names = [f"{number}.png" for number in numbers]
     cameras = [Camera(name, WIDTH, HEIGHT, K, pose) for name, pose in zip(names, extrinsics, strict=True)]
     images = np.ones((count, 3, HEIGHT, WIDTH), np.float32) * numbers[:, None, None, None]

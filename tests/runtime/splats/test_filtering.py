@@ -20,6 +20,7 @@ from views_in_a_row import extrinsics_in_a_row
 
 HEIGHT, WIDTH = 12, 16
 ARRAYS = ("means", "scales", "quats", "opacities", "sh")
+EXTRINSICS = extrinsics_in_a_row(0, 0.5)
 INTRINSICS = np.tile(np.array([[1.0, 0, 0.5], [0, WIDTH / HEIGHT, 0.5], [0, 0, 1]]), (2, 1, 1))
 
 
@@ -47,29 +48,29 @@ def wall(distance: float = 2.0) -> np.ndarray:
 
 def test_nothing_is_asked_for_by_default() -> None:
     assert FilterOptions().enabled == []
-    gaussians = one_a_pixel(wall(), extrinsics_in_a_row(0, 0.5))
+    gaussians = one_a_pixel(wall(), EXTRINSICS)
     filters = FilterOptions()
-    left, taken = filter_gaussians(gaussians, wall(), extrinsics_in_a_row(0, 0.5), INTRINSICS, filters)
+    left, taken = filter_gaussians(gaussians, wall(), EXTRINSICS, INTRINSICS, filters)
     assert taken == {}
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(left, name), getattr(gaussians, name))
 
 
 def test_faint_gaussians() -> None:
-    gaussians = one_a_pixel(wall(), extrinsics_in_a_row(0, 0.5))
+    gaussians = one_a_pixel(wall(), EXTRINSICS)
     gaussians.opacities[[3, 200]] = 0.04
     gaussians.opacities[7] = 0.05
     left, taken = filter_gaussians(
-        gaussians, wall(), extrinsics_in_a_row(0, 0.5), INTRINSICS, FilterOptions(min_opacity=np.float32(0.05))
+        gaussians, wall(), EXTRINSICS, INTRINSICS, FilterOptions(min_opacity=np.float32(0.05))
     )
     assert taken == {"min_opacity": 2}
     assert sorted(set(range(2 * HEIGHT * WIDTH)) - set(numbers(left))) == [3, 200]
 
 
 def test_borders() -> None:
-    gaussians = one_a_pixel(wall(), extrinsics_in_a_row(0, 0.5))
+    gaussians = one_a_pixel(wall(), EXTRINSICS)
     filters = FilterOptions(crop_border=2)
-    left, taken = filter_gaussians(gaussians, wall(), extrinsics_in_a_row(0, 0.5), INTRINSICS, filters)
+    left, taken = filter_gaussians(gaussians, wall(), EXTRINSICS, INTRINSICS, filters)
     assert taken == {"crop_border": 2 * (HEIGHT * WIDTH - (HEIGHT - 4) * (WIDTH - 4))}
     rows, columns = np.divmod(np.array(numbers(left)) % (HEIGHT * WIDTH), WIDTH)
     assert (rows.min(), rows.max(), columns.min(), columns.max()) == (2, HEIGHT - 3, 2, WIDTH - 3)
@@ -84,11 +85,7 @@ def test_depth_edges() -> None:
     np.testing.assert_allclose(jumps[1, :, 7:9], 0.25, atol=1e-6)
     assert not jumps[1, :, :7].any() and not jumps[1, :, 9:].any()
     left, taken = filter_gaussians(
-        one_a_pixel(depth, extrinsics_in_a_row(0, 0.5)),
-        depth,
-        extrinsics_in_a_row(0, 0.5),
-        INTRINSICS,
-        FilterOptions(max_depth_jump=0.1),
+        one_a_pixel(depth, EXTRINSICS), depth, EXTRINSICS, INTRINSICS, FilterOptions(max_depth_jump=0.1)
     )
     assert taken == {"max_depth_jump": 2 * HEIGHT}
     assert not {HEIGHT * WIDTH + 7, HEIGHT * WIDTH + 8} & set(numbers(left))
@@ -96,29 +93,27 @@ def test_depth_edges() -> None:
 
 def test_confidence_worked_by_hand() -> None:
     """Two cameras, .5 apart, before a wall at 2: what one sees at column c, the other sees 4 columns to the left."""
-    extrinsics = extrinsics_in_a_row(0, 0.5)
     depth = wall()
     depth[0, 4:8, 8:12] = 1.0  # a board in the air, which the second camera would see: 8 columns to the left, at 0 to 3
-    points = points_from_depth(depth, np.zeros((2, 3, HEIGHT, WIDTH)), extrinsics, INTRINSICS).positions
-    given = multi_view_consistency(points.reshape(2, HEIGHT, WIDTH, 3), depth, extrinsics, INTRINSICS)
+    points = points_from_depth(depth, np.zeros((2, 3, HEIGHT, WIDTH)), EXTRINSICS, INTRINSICS).positions
+    given = multi_view_consistency(points.reshape(2, HEIGHT, WIDTH, 3), depth, EXTRINSICS, INTRINSICS)
     expected = np.ones((2, HEIGHT, WIDTH))
     expected[0, 4:8, 8:12] = 0  # the second camera sees the wall through it
     np.testing.assert_array_equal(
         given, expected
     )  # and of the wall behind, which the first does not see, it says nothing
     left, taken = filter_gaussians(
-        one_a_pixel(depth, extrinsics), depth, extrinsics, INTRINSICS, FilterOptions(min_consistency=0.5)
+        one_a_pixel(depth, EXTRINSICS), depth, EXTRINSICS, INTRINSICS, FilterOptions(min_consistency=0.5)
     )
     assert taken == {"min_consistency": 16}
     assert len(left) == 2 * HEIGHT * WIDTH - 16
 
 
 def test_what_is_too_far_is_denied_by_what_sees_nearer() -> None:
-    extrinsics = extrinsics_in_a_row(0, 0.5)
     depth = wall()
     depth[0, 4:8, 8:12] = 4.0  # a hole: the second camera's wall there stands where the first sees through
-    points = points_from_depth(depth, np.zeros((2, 3, HEIGHT, WIDTH)), extrinsics, INTRINSICS).positions
-    given = multi_view_consistency(points.reshape(2, HEIGHT, WIDTH, 3), depth, extrinsics, INTRINSICS)
+    points = points_from_depth(depth, np.zeros((2, 3, HEIGHT, WIDTH)), EXTRINSICS, INTRINSICS).positions
+    given = multi_view_consistency(points.reshape(2, HEIGHT, WIDTH, 3), depth, EXTRINSICS, INTRINSICS)
     assert (given[0] == 1).all()  # behind the second camera's surface, which therefore does not judge
     hidden = np.zeros((HEIGHT, WIDTH), bool)
     hidden[5:7, 9 - 4 : 11 - 4] = True  # inside the hole, away from its rim
@@ -130,10 +125,9 @@ def test_what_is_too_far_is_denied_by_what_sees_nearer() -> None:
 
 def test_the_same_surface_is_merged_once() -> None:
     """The second camera sees 12 of its 16 columns where the first does, pixel on pixel."""
-    extrinsics = extrinsics_in_a_row(0, 0.5)
-    gaussians = one_a_pixel(wall(), extrinsics, opacity=0.5)
+    gaussians = one_a_pixel(wall(), EXTRINSICS, opacity=0.5)
     filters = FilterOptions(merge_duplicates=True)
-    left, taken = filter_gaussians(gaussians, wall(), extrinsics, INTRINSICS, filters)
+    left, taken = filter_gaussians(gaussians, wall(), EXTRINSICS, INTRINSICS, filters)
     assert taken == {"merge_duplicates": HEIGHT * 12}
     assert len(left) == HEIGHT * WIDTH + HEIGHT * 4
     first, second = left.select(np.arange(HEIGHT * WIDTH)), left.select(np.arange(HEIGHT * WIDTH, len(left)))
@@ -148,11 +142,10 @@ def test_the_same_surface_is_merged_once() -> None:
 
 
 def test_what_was_left_out_before_is_not_merged_into() -> None:
-    extrinsics = extrinsics_in_a_row(0, 0.5)
-    gaussians = one_a_pixel(wall(), extrinsics)
+    gaussians = one_a_pixel(wall(), EXTRINSICS)
     gaussians.opacities[: HEIGHT * WIDTH] = 0.01
     left, taken = filter_gaussians(
-        gaussians, wall(), extrinsics, INTRINSICS, FilterOptions(min_opacity=0.02, merge_duplicates=True)
+        gaussians, wall(), EXTRINSICS, INTRINSICS, FilterOptions(min_opacity=0.02, merge_duplicates=True)
     )
     assert taken == {"min_opacity": HEIGHT * WIDTH, "merge_duplicates": 0}
     assert numbers(left) == list(range(HEIGHT * WIDTH, 2 * HEIGHT * WIDTH))
@@ -212,13 +205,7 @@ def test_the_line_names_and_counts() -> None:
 )
 def test_what_cannot_be_asked_for(values: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        filter_gaussians(
-            one_a_pixel(wall(), extrinsics_in_a_row(0, 0.5)),
-            wall(),
-            extrinsics_in_a_row(0, 0.5),
-            INTRINSICS,
-            FilterOptions(**values),
-        )
+        filter_gaussians(one_a_pixel(wall(), EXTRINSICS), wall(), EXTRINSICS, INTRINSICS, FilterOptions(**values))
 
 
 # ---- effect on PSNR

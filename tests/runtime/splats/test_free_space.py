@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from idesplat.runtime.splats.free_space import FREE, MARGIN, REACH, find_in_free_space
+from views_in_a_row import extrinsics_in_a_row
 
 SURFACE = 2.0  # depth of a wall that all views see
 FREE_DEPTH = FREE * SURFACE
@@ -15,8 +16,7 @@ def found(points: list[tuple[float, float, float]], *positions: float, nearer: i
 
     nearer: how many pixels of each view have a hundredth of the wall's depth.
     """
-    extrinsics = np.tile(np.eye(4), (len(positions), 1, 1))
-    extrinsics[:, 0, 3] = positions
+    extrinsics = extrinsics_in_a_row(*positions)
     depth = np.full((len(positions), SIDE, SIDE), SURFACE, np.float32)
     depth.reshape(len(positions), -1)[:, :nearer] = SURFACE / 100
     intrinsics = np.tile(INTRINSICS, (len(positions), 1, 1))
@@ -55,8 +55,7 @@ def test_a_few_pixels_of_a_wrong_depth_do_not_decide() -> None:
 def test_the_unit_of_the_scene_cancels() -> None:
     rng = np.random.default_rng(0)
     means = rng.uniform([-0.5, -0.5, 0], [2.5, 0.5, 2], (500, 3))
-    extrinsics = np.tile(np.eye(4), (3, 1, 1))
-    extrinsics[:, 0, 3] = [0, 0.5, 2.0]
+    extrinsics = extrinsics_in_a_row(0, 0.5, 2)
     depth, intrinsics = rng.uniform(1.5, 3, (3, SIDE, SIDE)), np.tile(INTRINSICS, (3, 1, 1))
     once = find_in_free_space(means.astype(np.float32), depth, extrinsics, intrinsics)
     extrinsics[:, :3, 3] *= 8

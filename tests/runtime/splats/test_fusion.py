@@ -5,6 +5,7 @@ import pytest
 from idesplat.runtime.geometry.intrinsics import denormalize_intrinsics
 from idesplat.runtime.splats.fusion import find_contradicted, find_redundant
 from idesplat.runtime.splats.surfaces import Surfaces
+from views_in_a_row import extrinsics_in_a_row
 
 HEIGHT, WIDTH = 24, 32
 WALL = 4.0
@@ -14,9 +15,7 @@ K = np.array([[0.9, 0, 0.5], [0, 1.2, 0.5], [0, 0, 1]], np.float32)
 
 def cameras(count: int) -> np.ndarray:
     """Cameras side by side that look at the wall, camera-to-world [views, 4, 4]."""
-    extrinsics = np.tile(np.eye(4), (count, 1, 1))
-    extrinsics[:, 0, 3] = 0.3 * np.arange(count)
-    return extrinsics
+    return extrinsics_in_a_row(*(0.3 * np.arange(count)))
 
 
 def unproject(depth: np.ndarray, extrinsics: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ from idesplat.runtime.views.batch import build_view_batch
 from idesplat.runtime.views.exposure import MAX_GAIN, Exposure, compensate_exposure, solve_exposure
 from idesplat.runtime.views.exposure_mode import ExposureMode, parse_exposure_mode
 from idesplat.runtime.views.matching import PointMatches
+from views_in_a_row import extrinsics_in_a_row
 
 SIDE = 128  # pixels
 POINTS = 300  # of a pair of views
@@ -37,8 +38,7 @@ class Plane:
         self.offsets = np.broadcast_to(np.asarray(offsets, float), (len(gains), 3))
         self.wrong, self.blind, self.points = wrong, blind, points
         self.rng = np.random.default_rng(0)
-        self.extrinsics = np.tile(np.eye(4), (len(gains), 1, 1))
-        self.extrinsics[:, 0, 3] = STEP * np.arange(len(gains))
+        self.extrinsics = extrinsics_in_a_row(*(STEP * np.arange(len(gains))))
         self.intrinsics = np.tile(K, (len(gains), 1, 1))
         centres = (np.arange(SIDE) + 0.5) / SIDE
         u, v = np.meshgrid((centres - K[0, 2]) / K[0, 0], (centres - K[1, 2]) / K[1, 1])

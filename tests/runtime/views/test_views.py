@@ -15,6 +15,7 @@ from idesplat.runtime.errors import InputError
 from idesplat.runtime.views import selection as view_choice
 from idesplat.runtime.views.batch import build_view_batch, check_view_arrays, match_images_to_cameras
 from idesplat.runtime.views.selection import PairScorer, guess_scene_depths, score_pairs, select_views
+from views_in_a_row import extrinsics_in_a_row
 
 
 def names(pairs):
@@ -78,8 +79,7 @@ def test_choose_prefers_a_step_aside_to_a_step_forward():
 
 
 def test_what_cameras_are_known_to_see_decides_the_baseline():
-    poses = np.stack([np.eye(4)] * 4)
-    poses[:, 0, 3] = (0, 0.1, 1, 10)
+    poses = extrinsics_in_a_row(0, 0.1, 1, 10)
     for distance in (1, 10, 100):
         cameras = [replace(camera, depth_range=(0.5 * distance, 2.0 * distance)) for camera in at(poses)]
         first, second = select_views(cameras, 2)
@@ -108,8 +108,7 @@ def test_choose_does_not_depend_on_frame_or_unit():
 
 def test_choose_avoids_cameras_that_look_elsewhere():
     # Parallel cameras on a line; the second has the better baseline but is turned away from what the others see.
-    poses = np.stack([np.eye(4)] * 4)
-    poses[:, 0, 3] = (0, 0.26, 0.3, 1)
+    poses = extrinsics_in_a_row(0, 0.26, 0.3, 1)
     assert select_views(at(poses), 2) == [0, 1]
     poses[1, :3, :3] = cv2.Rodrigues(np.array([0, 2.5, 0]))[0]
     assert select_views(at(poses), 2) == [0, 2]

@@ -33,6 +33,7 @@ from idesplat.tools.evaluation.captures.camera_statistics import (
 )
 from idesplat.tools.evaluation.captures.capture import Capture, Triple
 from idesplat.tools.synthetic.sampler import Sample
+from views_in_a_row import extrinsics_in_a_row
 
 NAMES = [f"{index:03}.png" for index in range(5)]
 
@@ -100,8 +101,7 @@ def test_quantiles_of_pairs() -> None:
 
 def test_a_sample_gives_its_neighbouring_context_views() -> None:
     """Views at x = 0, 1, 3 and a target at 9, of depths 1, 3, 5: the medians of neighbours are 2 and 4."""
-    extrinsics = np.tile(np.eye(4, dtype=np.float32), (4, 1, 1))
-    extrinsics[:, 0, 3] = 0, 1, 3, 9
+    extrinsics = extrinsics_in_a_row(0, 1, 3, 9).astype(np.float32)
     depth = np.ones((4, 2, 4), np.float32) * np.array([1, 3, 5, 7], np.float32)[:, None, None]
     intrinsics = np.tile(np.array([[0.5, 0, 0.5], [0, 1, 0.5], [0, 0, 1]], np.float32), (4, 1, 1))
     sample = Sample(np.zeros((4, 3, 2, 4), np.float32), depth, extrinsics, intrinsics, 1.0, 8.0, 3)
