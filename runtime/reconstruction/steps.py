@@ -8,9 +8,10 @@ from typing import Any
 from ..errors import InputError
 from ..inference.model_files import ModelFiles
 from ..inference.predictor import Prediction
+from ..refinement.colors import fit_colors
 from ..refinement.options import RefinementOptions, prediction_options
 from ..refinement.refine import refine
-from ..refinement.views import posed_image
+from ..refinement.views import posed_image, posed_images
 from ..splats.filtering import FilterOptions, describe_removed, filter_gaussians
 from ..splats.free_space import find_in_free_space
 from ..splats.fusion import MIN_VOTING_VIEWS
@@ -22,7 +23,6 @@ from .bounds import check_max_gaussians
 from .many_views import voting_views
 from .quality import PRESETS, Preset, Quality, RefinementLimit, default_quality, parse_refine
 from .stereo import correct_depths
-from .view_colors import fit_view_colors
 
 # What fusion removes. Refinement takes less time with two copies of a surface, and gives better views. Without it, each
 # view is best shown by its own Gaussians, and a wrong one before a surface of its own colour is better than a hole.
@@ -106,7 +106,7 @@ def fuse(prediction: Prediction, views: ViewBatch, span: DepthRange, plan: Plan)
     started = time.perf_counter()
     voters = voting_views(views, span)
     if plan.fuses:
-        prediction = fit_view_colors(correct_depths(prediction, views, voters), views, voters)
+        prediction = correct_depths(prediction, views, voters)
     kept, removed = filter_gaussians(
         prediction.need_gaussians(),
         prediction.depth,
@@ -119,6 +119,8 @@ def fuse(prediction: Prediction, views: ViewBatch, span: DepthRange, plan: Plan)
     cleared = _clear_free_space(kept, prediction, views, plan)
     if cleared is not kept:
         kept, removed = cleared, removed | {"free_space": len(kept) - len(cleared)}
+    if plan.fuses and not plan.refines:
+        kept = fit_colors(kept, posed_images(views))
     notes = [describe_removed(removed, len(kept))] if any(removed.values()) else []
     return Stepped(replace(prediction, gaussians=kept), removed, {"fuse": time.perf_counter() - started}, notes)
 

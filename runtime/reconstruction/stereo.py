@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from ..inference.predictor import Prediction
-from ..splats.surfaces import Surfaces, bilinear, project_to_pixel
+from ..splats.surfaces import Surfaces, project_to_pixel
 from ..system.compilation import compiled
 from ..system.threads import map_in_threads
 from ..views.batch import ViewBatch
@@ -143,7 +143,19 @@ def _sample(
             u, v = across / away, down / away
             inside = away > 0 and 0.5 <= u < width - 0.5 and 0.5 <= v < height - 0.5
             seen[row, column] = inside
-            image[row, column] = bilinear(source, u, v) if inside else 0
+            image[row, column] = _bilinear(source, u, v) if inside else 0
+
+
+@compiled()
+def _bilinear(image: np.ndarray, x: float, y: float) -> float:
+    """The value of a map [height, width] at a position in pixels, whose centres are at .5; beside them the border's."""
+    height, width = image.shape
+    u, v = min(max(x - 0.5, 0.0), width - 1.0), min(max(y - 0.5, 0.0), height - 1.0)
+    left, top = min(int(u), width - 2), min(int(v), height - 2)
+    right, below = u - left, v - top
+    upper = image[top, left] * (1 - right) + image[top, left + 1] * right
+    lower = image[top + 1, left] * (1 - right) + image[top + 1, left + 1] * right
+    return upper * (1 - below) + lower * below
 
 
 @compiled()

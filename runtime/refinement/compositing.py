@@ -231,11 +231,18 @@ def end_of_entries(index: int, boxes: np.ndarray, offsets: np.ndarray) -> int:
 
 
 @compiled_fast
-def add_weights(
-    boxes: np.ndarray, offsets: np.ndarray, gradients: np.ndarray, start: int, stop: int, total: np.ndarray
+def add_columns(
+    boxes: np.ndarray,
+    offsets: np.ndarray,
+    gradients: np.ndarray,
+    first: int,
+    start: int,
+    stop: int,
+    total: np.ndarray,  # [gaussians, columns]
 ) -> None:
-    """Add the weights in the image of the Gaussians from `start` to `stop` to `total`, [gaussians] float64."""
+    """Add the entries' gradients from the column `first` on, of the Gaussians from `start` to `stop`, to `total`."""
     for index in range(start, stop):
         if boxes[index, 3] > boxes[index, 2]:
             for entry in range(offsets[index], end_of_entries(index, boxes, offsets)):
-                total[index] += gradients[entry, WEIGHT]
+                for column in range(total.shape[1]):
+                    total[index, column] += gradients[entry, first + column]

@@ -190,9 +190,17 @@ class GradientRasterizer:
 
     def weights(self, done: Pass, gradients: np.ndarray) -> np.ndarray:
         """Each Gaussian's weight in the image, the sum of alpha T over the pixels, float64 [gaussians]."""
-        total = np.zeros(len(self.parameters))
+        return self._columns(done, gradients, compositing.WEIGHT)[:, 0]
+
+    def color_sums(self, done: Pass, gradients: np.ndarray) -> np.ndarray:
+        """Sums over the pixels of alpha T times the gradient of the rgb, and of alpha T, float64 [gaussians, 4]."""
+        return self._columns(done, gradients, compositing.RED)
+
+    def _columns(self, done: Pass, gradients: np.ndarray, first: int) -> np.ndarray:
+        """The sums of the columns from `first` on over each Gaussian's entries."""
+        total = np.zeros((len(self.parameters), compositing.ENTRY - first))
         self._over_gaussians(
-            lambda start, stop: compositing.add_weights(done.boxes, done.offsets, gradients, start, stop, total)
+            lambda start, stop: compositing.add_columns(done.boxes, done.offsets, gradients, first, start, stop, total)
         )
         return total
 

@@ -18,6 +18,7 @@ from .poses import move_world
 from .rasterizer import GradientRasterizer, Parameters, Pass, Target, compile_all
 from .view_adam import ViewAdam
 
+LEAST_OPACITY, LEAST_SCALE = 1e-4, 1e-12  # whose logits and logarithms are finite
 MAX_TRANSMITTANCE = 0.5  # of a pixel that counts as covered
 DEFAULT = RefinementOptions()
 COARSE = 3.0  # times the median size in the images, from where a Gaussian is one of a backdrop
@@ -129,7 +130,7 @@ class Optimiser:
         """One step on one view, with this factor on all learning rates; the view's PSNR before it."""
         done = self.rasterizer.forward(self.views[index].target)
         if not self.exposure_adam.visits[index]:
-            self.views[index] = _covered(self.views[index], done)
+            self.views[index] = covered(self.views[index], done)
         view = self.views[index]
         gain, offset = (values[index].astype(np.float32) for values in (self.gains, self.offsets))
         rendered = done.rgb * gain + offset
@@ -187,18 +188,23 @@ class Optimiser:
         self.views[index] = replace(self.views[index], viewmat=move_world(self.views[index].viewmat, motion))
 
 
-def _covered(view: PosedImage, done: Pass) -> PosedImage:
+def covered(view: PosedImage, done: Pass) -> PosedImage:
     """The view without the pixels where less than half of the light is stopped by the scene."""
     return replace(view, valid=view.valid & (done.transmittance < MAX_TRANSMITTANCE))
+
+
+def as_parameters(gaussians: Gaussians, opacities: np.ndarray, scales: np.ndarray) -> Parameters:
+    """The Gaussians as the rasteriser takes them, with these opacities and scales."""
+    opacities = np.maximum(opacities, LEAST_OPACITY).astype(np.float64)
+    log_scales = np.log(np.maximum(scales.astype(np.float64), LEAST_SCALE))
+    arrays = (gaussians.means, gaussians.quats, log_scales, np.log(opacities / (1 - opacities)), gaussians.sh)
+    return Parameters(*(np.array(array, np.float32, order="C") for array in arrays))
 
 
 def _parameters(gaussians: Gaussians, views: Sequence[PosedImage], options: RefinementOptions) -> Parameters:
     """The Gaussians as they start. A backdrop keeps its opacity: nothing behind it should show, least of all black."""
     most = np.where(_coarse(gaussians, views), max(DEFAULT.max_opacity, options.max_opacity), options.max_opacity)
-    opacities = np.clip(gaussians.opacities, 1e-4, most).astype(np.float64)
-    scales = np.maximum(gaussians.scales.astype(np.float64) * options.scale_factor, 1e-12)
-    arrays = (gaussians.means, gaussians.quats, np.log(scales), np.log(opacities / (1 - opacities)), gaussians.sh)
-    return Parameters(*(np.array(array, np.float32, order="C") for array in arrays))
+    return as_parameters(gaussians, np.minimum(gaussians.opacities, most), gaussians.scales * options.scale_factor)
 
 
 def _coarse(gaussians: Gaussians, views: Sequence[PosedImage]) -> np.ndarray:

@@ -8,9 +8,11 @@ import numpy as np
 from ..cameras.camera import Camera, resize_camera
 from ..cameras.undistortion import UndistortedImage, undistorted_copy
 from ..errors import InputError, error_context
+from ..geometry.intrinsics import denormalize_intrinsics
 from ..geometry.rigid import invert_rigid
 from ..images.io import load_image
 from ..system.progress import progress
+from ..views.batch import ViewBatch
 from .refine import PosedImage
 
 
@@ -29,6 +31,18 @@ def posed_image(copy: UndistortedImage, extrinsics: np.ndarray) -> PosedImage:
     """A copy of an image as refinement takes it; pixels that the lens did not see have no weight."""
     image = copy.image.astype(np.float32) / 255
     return PosedImage(image, invert_rigid(extrinsics), copy.camera.K, copy.valid)
+
+
+def posed_images(views: ViewBatch) -> list[PosedImage]:
+    """The images that the network gets, to fit to; all of their pixels count."""
+    height, width = views.images.shape[2:]
+    Ks = denormalize_intrinsics(views.intrinsics, width, height)
+    valid = np.ones((height, width), bool)
+    images = views.images.transpose(0, 2, 3, 1)
+    return [
+        PosedImage(image, invert_rigid(pose), K, valid)
+        for image, pose, K in zip(images, views.extrinsics, Ks, strict=True)
+    ]
 
 
 def _load(path: Path, camera: Camera, max_side: int) -> UndistortedImage:

@@ -104,36 +104,20 @@ def _gradient(inverse: np.ndarray, axis: int) -> np.ndarray:
 
 
 @compiled()
-def project(point: np.ndarray, viewmat: np.ndarray, K: np.ndarray) -> tuple[float, float, float]:
-    """The z-depth of a point, and x and y of its image in pixels, which mean nothing for a depth of 0 or less."""
-    x, y, z = point[0], point[1], point[2]
-    depth = viewmat[2, 0] * x + viewmat[2, 1] * y + viewmat[2, 2] * z + viewmat[2, 3]
-    across = viewmat[0, 0] * x + viewmat[0, 1] * y + viewmat[0, 2] * z + viewmat[0, 3]
-    down = viewmat[1, 0] * x + viewmat[1, 1] * y + viewmat[1, 2] * z + viewmat[1, 3]
-    return depth, K[0, 0] * across / depth + K[0, 2], K[1, 1] * down / depth + K[1, 2]
-
-
-@compiled()
 def project_to_pixel(
     point: np.ndarray, viewmat: np.ndarray, K: np.ndarray, height: int, width: int
 ) -> tuple[float, int, int]:
     """The z-depth of a point, and the row and column of its pixel; the row is -1 outside the image."""
-    depth, x, y = project(point, viewmat, K)
-    if depth <= 0 or not (0 <= x < width and 0 <= y < height):
+    x, y, z = point[0], point[1], point[2]
+    depth = viewmat[2, 0] * x + viewmat[2, 1] * y + viewmat[2, 2] * z + viewmat[2, 3]
+    if depth <= 0:
         return depth, -1, 0
-    return depth, int(y), int(x)
-
-
-@compiled()
-def bilinear(image: np.ndarray, x: float, y: float) -> float:
-    """The value of a map [height, width] at a position in pixels, whose centres are at .5; beside them the border's."""
-    height, width = image.shape
-    u, v = min(max(x - 0.5, 0.0), width - 1.0), min(max(y - 0.5, 0.0), height - 1.0)
-    left, top = min(int(u), width - 2), min(int(v), height - 2)
-    right, below = u - left, v - top
-    upper = image[top, left] * (1 - right) + image[top, left + 1] * right
-    lower = image[top + 1, left] * (1 - right) + image[top + 1, left + 1] * right
-    return upper * (1 - below) + lower * below
+    across = viewmat[0, 0] * x + viewmat[0, 1] * y + viewmat[0, 2] * z + viewmat[0, 3]
+    down = viewmat[1, 0] * x + viewmat[1, 1] * y + viewmat[1, 2] * z + viewmat[1, 3]
+    column, row = K[0, 0] * across / depth + K[0, 2], K[1, 1] * down / depth + K[1, 2]
+    if not (0 <= column < width and 0 <= row < height):
+        return depth, -1, 0
+    return depth, int(row), int(column)
 
 
 @compiled()

@@ -5,12 +5,14 @@ from types import SimpleNamespace
 
 import numpy as np
 from idesplat.runtime.cameras.undistortion import UndistortedImage
+from idesplat.runtime.geometry.sh import SH_0
 from idesplat.runtime.inference.bundled_model import bundled_model
 from idesplat.runtime.inference.predictor import Prediction
-from idesplat.runtime.reconstruction.steps import Plan, make_plan, refine_prediction
+from idesplat.runtime.reconstruction.steps import Plan, fuse, make_plan, refine_prediction
 from idesplat.runtime.splats.filtering import FilterOptions
 from idesplat.runtime.splats.gaussians import Gaussians
 from idesplat.runtime.views.batch import ViewBatch
+from idesplat.runtime.views.depth_range import DepthRange
 from views_in_a_row import prediction_of, views_in_a_row
 
 SIDE, PLANE = 24, 4.0
@@ -61,3 +63,20 @@ def test_the_exposure_of_a_darker_photograph_is_told() -> None:
     found = refine_prediction(prediction, views, plan_of("standard", 20), None).exposure
     grey = np.full((1, 1, 3), 0.5)
     assert (found.undo(grey, 1) < found.undo(grey, 0)).all()
+
+
+def fused(quality: str, steps: int) -> Gaussians:
+    """Black Gaussians of grey views."""
+    prediction, views = plane_before((0.0, 1.0))
+    black = replace(prediction.need_gaussians(), sh=np.full_like(prediction.need_gaussians().sh, -0.5 / SH_0))
+    black = black.select(np.arange(2 * SIDE * SIDE))
+    plan = plan_of(quality, steps)
+    return fuse(
+        replace(prediction, gaussians=black), views, DepthRange(1, 10, "given"), plan
+    ).prediction.need_gaussians()
+
+
+def test_colours_are_fitted_where_no_refinement_does_it() -> None:
+    assert np.median(fused("standard", 0).colours) > 0.4
+    for quality, steps in (("standard", 3), ("fast", 0)):
+        np.testing.assert_allclose(fused(quality, steps).colours, 0, atol=1e-6)
