@@ -24,7 +24,7 @@ from ..system.progress import progress
 from .rasterizer import GradientRasterizer, compile_all
 from .refine import PosedImage, as_parameters, covered
 
-ROUNDS = 3
+ROUNDS = 4
 RELAXATION = 1.4  # of a change; below 2, the rounds converge
 STIFFNESS = 0.015  # directions differ by some tenths
 LEAST_WEIGHT = 0.1  # pixels: a Gaussian that is hidden in all views keeps its colour
