@@ -37,7 +37,8 @@ class Preset:
 
     views: how many images are used where neither --views nor --select says it. pixels: least area of the images that
     the network gets; that of its training if larger. fuse: whether depths are corrected by the other views,
-    Gaussians that these see through and surplus copies of a surface are removed, and holes closed.
+    Gaussians that these see through and surplus copies of a surface are removed, holes closed, and colours fitted to
+    the images where no refinement follows.
     steps_per_added_view, seconds: of the refinement, whichever ends first; no steps for none. Steps count for each
     image beyond the first: two images are soon overfitted, more are not. The seconds are those of `views` images; each
     further one adds SECONDS_PER_FURTHER_VIEW. copy_side: longer side of the images that it fits, in pixels.

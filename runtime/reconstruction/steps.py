@@ -55,7 +55,7 @@ class Plan:
 
     @property
     def fuses(self) -> bool:
-        """Whether depths and colours are made to suit all views, and what these do not confirm is removed."""
+        """Whether depths are made to suit all views, and what these do not confirm is removed."""
         return self.preset.fuse and self.gaussians
 
     def refinement(self, views: int) -> RefinementOptions:
@@ -100,7 +100,10 @@ def make_plan(
 
 
 def fuse(prediction: Prediction, views: ViewBatch, span: DepthRange, plan: Plan) -> Stepped:
-    """The Gaussians that the plan's filters keep; if it fuses views, with depths and colours that suit all of them."""
+    """The Gaussians that the plan's filters keep; if it fuses views, with depths that suit all of them.
+
+    If no refinement follows, which would fit the colours, they are fitted to the views' images.
+    """
     if not (plan.fuses or plan.filters.enabled):
         return Stepped(prediction)
     started = time.perf_counter()

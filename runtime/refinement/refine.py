@@ -18,7 +18,7 @@ from .poses import move_world
 from .rasterizer import GradientRasterizer, Parameters, Pass, Target, compile_all
 from .view_adam import ViewAdam
 
-LEAST_OPACITY, LEAST_SCALE = 1e-4, 1e-12  # whose logits and logarithms are finite
+LEAST_OPACITY, MOST_OPACITY, LEAST_SCALE = 1e-4, 1 - 1e-7, 1e-12  # whose logits and logarithms are finite
 MAX_TRANSMITTANCE = 0.5  # of a pixel that counts as covered
 DEFAULT = RefinementOptions()
 COARSE = 3.0  # times the median size in the images, from where a Gaussian is one of a backdrop
@@ -195,7 +195,7 @@ def covered(view: PosedImage, done: Pass) -> PosedImage:
 
 def as_parameters(gaussians: Gaussians, opacities: np.ndarray, scales: np.ndarray) -> Parameters:
     """The Gaussians as the rasteriser takes them, with these opacities and scales."""
-    opacities = np.maximum(opacities, LEAST_OPACITY).astype(np.float64)
+    opacities = np.clip(opacities.astype(np.float64), LEAST_OPACITY, MOST_OPACITY)
     log_scales = np.log(np.maximum(scales.astype(np.float64), LEAST_SCALE))
     arrays = (gaussians.means, gaussians.quats, log_scales, np.log(opacities / (1 - opacities)), gaussians.sh)
     return Parameters(*(np.array(array, np.float32, order="C") for array in arrays))

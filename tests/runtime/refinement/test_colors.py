@@ -95,6 +95,14 @@ def test_what_no_view_shows_keeps_its_colour() -> None:
     assert (after.colours[: len(shown)] > 0.6).any()
 
 
+def test_opaque_gaussians_are_fitted_too() -> None:
+    opaque = wall((0.0,), 4)
+    opaque = replace(opaque, opacities=np.ones(len(opaque), np.float32))
+    fitted = fit_colors(opaque, [posed(plain(0.8), 0)])
+    np.testing.assert_array_equal(fitted.opacities, 1)
+    np.testing.assert_allclose(rendered(fitted, 0)[4:12, 4:12], 0.8, atol=0.02)
+
+
 def test_pixels_that_the_scene_does_not_cover_count_for_nothing() -> None:
     """Faint Gaussians would have to be far brighter than white to show a white image on black."""
     faint = wall((0.0,), 4)
