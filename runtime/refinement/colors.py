@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..geometry.rigid import invert_rigid
-from ..geometry.sh import SH_0, SH_1
+from ..geometry.sh import SH_0, SH_1, sh_basis
 from ..splats.gaussians import Gaussians
 from ..system.progress import progress
 from .rasterizer import GradientRasterizer, compile_all
@@ -30,7 +30,6 @@ STIFFNESS = 0.015  # directions differ by some tenths
 LEAST_WEIGHT = 0.1  # pixels: a Gaussian that is hidden in all views keeps its colour
 SEEN = 1e-6  # pixels: the least weight, so that the equations of what no view shows have a solution
 LINEAR = 4  # coefficients of SH up to degree 1
-Y_1_AXES, Y_1_SIGNS = [1, 2, 0], np.array([-1, 1, -1], np.float32)  # of degree 1, the basis is SH_1 (-y, z, -x)
 BLOCK = 1 << 17  # Gaussians whose equations are solved at once
 
 
@@ -55,7 +54,7 @@ def fit_colors(gaussians: Gaussians, views: Sequence[PosedImage]) -> Gaussians:
 def _equations(
     rasterizer: GradientRasterizer, views: Sequence[PosedImage], unknowns: int, title: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The normal equations of all Gaussians without what keeps a and b small, from a render of each view.
+    """The normal equations of the SH of all Gaussians without what keeps a and b small, from a render of each view.
 
     Returns float32 [gaussians, unknowns, unknowns] and [gaussians, unknowns, 3].
     """
@@ -67,23 +66,16 @@ def _equations(
         residual = (view.image - done.rgb) * covered(view, done).weights
         sums = rasterizer.color_sums(done, rasterizer.backward(done, residual))
         seen = np.flatnonzero(sums[:, 3])
-        coefficients = np.ones((len(seen), unknowns), np.float32)
-        if unknowns == LINEAR:
-            center = invert_rigid(view.viewmat)[:3, 3].astype(np.float32)
-            rays = means[seen] - center
-            coefficients[:, 1:] = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-        normal[seen] += sums[seen, 3, None, None] * coefficients[:, :, None] * coefficients[:, None]
-        right[seen] += coefficients[:, :, None] * sums[seen, None, :3]
+        rays = means[seen] - invert_rigid(view.viewmat)[:3, 3].astype(np.float32)
+        basis = sh_basis(rays / np.linalg.norm(rays, axis=1, keepdims=True), unknowns)
+        normal[seen] += sums[seen, 3, None, None] * basis[:, :, None] * basis[:, None]
+        right[seen] += basis[:, :, None] * sums[seen, None, :3]
     return normal, right
 
 
 def _sh_change(normal: np.ndarray, right: np.ndarray) -> np.ndarray:
     """The change of SH that the normal equations of some Gaussians give, float32 [gaussians, unknowns, 3]."""
-    unknowns, weight = normal.shape[1], np.maximum(normal[:, 0, 0], SEEN).astype(np.float64)
-    ridge = weight[:, None, None] * np.diag([0] + [STIFFNESS] * (unknowns - 1))
-    ridge[:, 0, 0] = LEAST_WEIGHT
-    change = np.linalg.solve(normal + ridge, right)
-    change[:, 0] /= SH_0
-    if unknowns == LINEAR:
-        change[:, 1:] = Y_1_SIGNS[:, None] * change[:, 1:][:, Y_1_AXES] / SH_1
-    return change.astype(np.float32)
+    weight = np.maximum(normal[:, 0, 0] / SH_0**2, SEEN).astype(np.float64)
+    ridge = weight[:, None, None] * np.eye(normal.shape[1]) * STIFFNESS * SH_1**2  # b is SH_1 times the SH of degree 1
+    ridge[:, 0, 0] = LEAST_WEIGHT * SH_0**2  # and a is SH_0 times that of degree 0
+    return np.linalg.solve(normal + ridge, right).astype(np.float32)
