@@ -24,14 +24,14 @@ HANDSHAKE = {
     "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
     "Sec-WebSocket-Version": "13",
 }
-# Tries to connect as a page, and says what came of it and how many messages.
+# Tries to connect as a page, and says whether it did and received a message, which a busy machine may send late.
 CONNECT = """
 ([url, protocol]) => new Promise(resolve => {
-  let opened = false, messages = 0
+  let opened = false
   const socket = new WebSocket(url, protocol)
-  socket.onopen = () => { opened = true; setTimeout(() => resolve([opened, messages]), 3000) }
-  socket.onmessage = () => { messages += 1 }
-  socket.onerror = () => resolve([opened, messages])
+  socket.onopen = () => { opened = true; setTimeout(() => resolve([opened, false]), 60000) }
+  socket.onmessage = () => resolve([opened, true])
+  socket.onerror = () => resolve([opened, false])
 })
 """
 
@@ -128,9 +128,7 @@ def test_pages_of_other_origins_in_a_browser(own, browser, served):
             found[name] = tab.evaluate(CONNECT, [socket_address, protocol])
             context.close()
         elsewhere.shutdown()
-    assert found["other"] == [False, 0]
-    opened, messages = found["own"]
-    assert opened and messages > 0
+    assert found == {"other": [False, False], "own": [True, True]}
 
 
 def test_a_name_that_leads_here_in_a_browser(own, browser):
@@ -144,7 +142,7 @@ def test_a_name_that_leads_here_in_a_browser(own, browser):
         tab = rebound.new_page()
         assert tab.goto(f"http://rebound.example.com:{port}/").status == 403
         connect = [f"ws://rebound.example.com:{port}", f"viser-v{viser.__version__}"]
-        assert tab.evaluate(CONNECT, connect) == [False, 0]
+        assert tab.evaluate(CONNECT, connect) == [False, False]
 
 
 def test_a_busy_port_means_the_next(served, scene):
