@@ -70,9 +70,9 @@ runs/textures:
 	find runs/textures.part \( -type l -o -size -60k -o -name '*.deb' \) ! -type d -delete
 	mv runs/textures.part runs/textures
 
-# A model like the bundled one, trained from nothing: depth, then the head on that depth, then all parts. Each command
-# resumes where it was stopped. The first is that of a GPU, where DEPTH_ON="--device cuda --threads 4 --together 24
-# --loaders 8" takes some 15 minutes (MODEL_CARD.md, which also tells how the bundled weights were made).
+# A model like the bundled one, trained from nothing: depth, then the head on that depth, then all parts, in two runs. Each
+# command resumes where it was stopped. The first is that of a GPU, where DEPTH_ON="--device cuda --threads 4 --together
+# 24 --loaders 8" takes some 15 minutes (MODEL_CARD.md, which also tells how the bundled weights were made).
 DEPTH_ON := --processes 2
 LITE := $(BIN)/idesplat train --preset idesplat-lite --textures runs/textures --size 256
 weights: setup runs/textures
@@ -81,7 +81,9 @@ weights: setup runs/textures
 		--perceptual none --processes 2 --precision bf16 --seed 152
 	$(LITE) --out runs/all --init runs/head/last.ckpt --no-curriculum --steps 300 --batch 2 --lr 3e-4 --perceptual lite0 \
 		--consistency 0.01 --processes 2 --precision bf16 --seed 153
-	$(BIN)/idesplat export runs/all/last.ckpt runs/idesplat-lite.onnx --preset idesplat-lite --overwrite
+	$(LITE) --out runs/longer --init runs/all/last.ckpt --no-curriculum --steps 1000 --batch 2 --lr 3e-4 --perceptual lite0 \
+		--consistency 0.01 --processes 2 --precision bf16 --seed 161
+	$(BIN)/idesplat export runs/longer/last.ckpt runs/idesplat-lite.onnx --preset idesplat-lite --overwrite
 
 clean:
 	rm -rf $(VENV) build site .typing tests/npm/node_modules docs/examples/node_modules runtime/web/vendor *.egg-info
