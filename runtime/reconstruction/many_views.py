@@ -1,7 +1,8 @@
 """Prediction for any number of views, in groups as large as the network was trained with, and as fit the memory."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from ..views.batch import ViewBatch
 from ..views.depth_range import BASELINE, DepthRange
 from ..views.groups import ViewGroup, group_views, nearest_views
 from .agreement import Agreement
+from .enlarging import network_size, predict_enlarged
 
 # Pixels of all views that the network gets together: about 2 GB of memory with the bundled model.
 GROUP_PIXELS = 600_000
@@ -27,20 +29,31 @@ OTHER_PIXELS = 16_000_000
 
 
 def predict_views(
-    predictor: Predictor, views: ViewBatch, span: DepthRange, near: float | None = None, far: float | None = None
+    predictor: Predictor,
+    views: ViewBatch,
+    span: DepthRange,
+    near: float | None = None,
+    far: float | None = None,
+    enlarge: bool = False,
 ) -> Prediction:
     """Depth and Gaussians of all views, each predicted beside the views that suit it best.
 
     Where groups overlap, a view is predicted several times: of these, each pixel is the one that most views agree with.
     span: the depth range of all views. near, far: where they are given; else each group has its own depth range, which
-    is narrower, so that more depth candidates lie where its surfaces are.
+    is narrower, so that more depth candidates lie where its surfaces are. enlarge: whether the network gets images that
+    are too large for it smaller (`enlarging`).
     """
     height, width = views.images.shape[2:]
+    predict = predictor.predict_views
+    if enlarge:
+        height, width = network_size(predictor.model, height, width)
+        predict = partial(predict_enlarged, predictor)
     size = max(MIN_GROUP, min(max(predictor.metadata.trained_views), GROUP_PIXELS // (height * width)))
     groups = group_views(views.cameras, _middle_depths(views, span), size)
     if len(groups) == 1:
-        return predictor.predict_views(views, span.near, span.far)
-    parts, seconds = _predict_groups(predictor, views, groups, span, near, far)
+        return predict(views, span.near, span.far)
+    range_of = partial(_own_range, predictor, span=span, near=near, far=far)
+    parts, seconds = _predict_groups(predict, range_of, views, groups)
     ordered = _choose(parts, views, span)
     gaussians = [part.gaussians for part in ordered if part.gaussians is not None]
     return Prediction(
@@ -52,12 +65,10 @@ def predict_views(
 
 
 def _predict_groups(
-    predictor: Predictor,
+    predict: Callable[[ViewBatch, float, float], Prediction],
+    range_of: Callable[[ViewBatch], DepthRange],
     views: ViewBatch,
     groups: Sequence[ViewGroup],
-    span: DepthRange,
-    near: float | None,
-    far: float | None,
 ) -> tuple[list[list[Prediction]], dict[str, float]]:
     """All predictions that are kept of each view, that of its own group first, and the seconds that they took."""
     own: dict[int, Prediction] = {}
@@ -66,8 +77,8 @@ def _predict_groups(
     seconds: dict[str, float] = {}
     for group in progress(groups, "predicting groups of views"):
         members = _subset(views, group.views)
-        depths = _own_range(predictor, members, span, near, far)
-        prediction = predictor.predict_views(members, depths.near, depths.far)
+        depths = range_of(members)
+        prediction = predict(members, depths.near, depths.far)
         for name, value in prediction.seconds.items():
             seconds[name] = seconds.get(name, 0) + value
         for place, view in enumerate(group.views):

@@ -72,8 +72,8 @@ def reconstruct(
     quality: "fast", "standard" or "high" (`quality.PRESETS`); by default standard with the bundled model, and with
     another one fast, the prediction as it is. refine: instead of the quality's, steps of refinement ("100", "0") or its
     time ("30s"). max_gaussians: how many to keep at most, those that contribute most; 0 for all.
-    size: height and width to work at instead of the images' own shape. crop: work at the trained size, on the middle of
-    the images.
+    size: height and width to work at instead of the images' own shape (`enlarging` says what the network gets of large
+    ones). crop: work at the trained size, on the middle of the images.
     near, far: bounds of depth in scene units; found from matched points or the baseline where not given.
     offset: "auto" or "X,Y,Z", subtracted from world coordinates that float32 does not hold.
     exposure: "auto" brings the views to a common exposure and white balance where these differ; "off" leaves the images
@@ -125,7 +125,7 @@ def reconstruct(
         placed, notes = apply_offset(exposed, offset, span.near)
         seconds = {"load": load_seconds, "prepare": prepared - started + time.perf_counter() - loaded}
         with working("predicting depth and Gaussians"):
-            prediction = predict_views(predictor, placed, span, near, far)
+            prediction = predict_views(predictor, placed, span, near, far, enlarge=plan.fuses)
         LOG.info("predicted in %s", ", ".join(f"{name} {value:.2f} s" for name, value in prediction.seconds.items()))
         del predictor  # its memory is needed for the refinement, unless the caller keeps it open
         seconds |= prediction.seconds

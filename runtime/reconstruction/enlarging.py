@@ -1,0 +1,98 @@
+"""Predictions of larger images: the network is given them smaller, and its result is enlarged to their size.
+
+A network is accurate near the size of the images that it was trained with. Of larger ones it sees less context in a
+patch: plain surfaces get wrong depth, while details of depth gain little. So depth comes from smaller images, and
+colours from the whole ones. At each pixel of an image the Gaussian of the smaller image's pixel there is repeated, at
+the interpolated depth and as much smaller as the pixels are, in the pixel's own colour.
+"""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from ..geometry.intrinsics import scale_intrinsics
+from ..geometry.sh import SH_0
+from ..images.sizes import whole_frame_size
+from ..inference.model_files import ModelFiles
+from ..inference.predictor import Prediction, Predictor
+from ..splats.gaussians import Gaussians
+from ..splats.points import unproject
+from ..views.batch import ViewBatch
+
+# In areas of the images of its training: the least that is too large for a network, and about what it is given instead.
+# Whole frames of high quality are smaller (`quality.PRESETS`).
+TOO_LARGE, GIVEN = 2.6, 2
+
+
+def network_size(model: ModelFiles, height: int, width: int) -> tuple[int, int]:
+    """Height and width at which the network predicts images of this size: theirs, unless they are too large for it."""
+    own = model.metadata
+    trained = own.height * own.width
+    if own.fixed_size or height * width < TOO_LARGE * trained:
+        return height, width
+    return whole_frame_size(height / width, GIVEN * trained, own.size_multiple)
+
+
+def predict_enlarged(predictor: Predictor, views: ViewBatch, near: float, far: float) -> Prediction:
+    """Depth and Gaussians for each pixel of the views, from images of `network_size`."""
+    height, width = views.images.shape[2:]
+    size = network_size(predictor.model, height, width)
+    if size == (height, width):
+        return predictor.predict_views(views, near, far)
+    smaller = replace(views, images=resize_images(views.images, *size), copies=())
+    return enlarge(predictor.predict_views(smaller, near, far), smaller.images, views)
+
+
+def enlarge(prediction: Prediction, images: np.ndarray, views: ViewBatch) -> Prediction:
+    """A prediction from smaller images [views, 3, h, w] at the size of the views' images."""
+    height, width = views.images.shape[2:]
+    _, small_height, small_width = prediction.depth.shape
+    depth = np.stack([_interpolate(surface, height, width) for surface in prediction.depth])
+    scale_x, scale_y = width / small_width, height / small_height
+    cameras = [
+        replace(camera, width=width, height=height, K=scale_intrinsics(camera.K, scale_x, scale_y))
+        for camera in prediction.cameras
+    ]
+    gaussians = None if prediction.gaussians is None else _repeat(prediction.gaussians, prediction.depth, depth, views)
+    if gaussians is not None:
+        detail = views.images - _nearest(images, height, width)  # [views, 3, height, width]
+        gaussians.sh[:, 0] += detail.transpose(0, 2, 3, 1).reshape(-1, 3) / np.float32(SH_0)
+    return Prediction(depth, gaussians, prediction.seconds, cameras)
+
+
+def resize_images(images: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Images [views, 3, h, w] at a smaller size, float32 [views, 3, height, width]."""
+    return np.stack([_resize(image, height, width) for image in images])
+
+
+def _resize(image: np.ndarray, height: int, width: int) -> np.ndarray:
+    rows = np.ascontiguousarray(image.transpose(1, 2, 0))
+    return cv2.resize(rows, (width, height), interpolation=cv2.INTER_AREA).transpose(2, 0, 1)
+
+
+def _interpolate(depth: np.ndarray, height: int, width: int) -> np.ndarray:
+    """A depth map [h, w] at a larger size, float32 [height, width]. Inverse depth is bilinear: planes stay planes."""
+    return 1 / cv2.resize(1 / depth, (width, height), interpolation=cv2.INTER_LINEAR)
+
+
+def _repeat(gaussians: Gaussians, small_depth: np.ndarray, depth: np.ndarray, views: ViewBatch) -> Gaussians:
+    """The Gaussian of the pixel there at each pixel of larger depth maps, at its depth and of its size.
+
+    gaussians: one for each pixel of `small_depth`, [views, h, w], ordered by view, row, column. depth: [views, height,
+    width].
+    """
+    place = _nearest(np.arange(small_depth.size).reshape(small_depth.shape), *depth.shape[1:]).ravel()
+    repeated = gaussians.select(place)
+    closeness = depth.ravel() / small_depth.ravel()[place] * np.sqrt(small_depth[0].size / depth[0].size)
+    means = unproject(depth, views.extrinsics, views.intrinsics).reshape(-1, 3).astype(np.float32)
+    return replace(repeated, means=means, scales=repeated.scales * closeness[:, None].astype(np.float32))
+
+
+def _nearest(maps: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Maps [..., h, w] at a larger size, [..., height, width]: each pixel has the value at its centre."""
+    rows, columns = (
+        ((np.arange(large) + 0.5) * small / large).astype(int)
+        for large, small in zip((height, width), maps.shape[-2:], strict=True)
+    )
+    return maps[..., rows[:, None], columns]
