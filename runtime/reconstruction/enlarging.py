@@ -1,9 +1,9 @@
 """Predictions of larger images: the network is given them smaller, and its result is enlarged to their size.
 
-A network is accurate near the size of the images that it was trained with. Of larger ones it sees less context in a
-patch: plain surfaces get wrong depth, while details of depth gain little. So depth comes from smaller images, and
-colours from the whole ones. At each pixel of an image the Gaussian of the smaller image's pixel there is repeated, at
-the interpolated depth and as much smaller as the pixels are, in the pixel's own colour.
+A network is accurate near the size of the images that it was trained with. Of larger ones a patch shows it less, so
+that plain surfaces get wrong depth. Here depth comes from smaller images, colours from the whole ones: at each pixel of
+a whole image the Gaussian of the smaller image's pixel there is repeated, at the interpolated depth, with scales that
+shrink as the pixels do, and with a colour that changes by the difference between both images.
 """
 
 from dataclasses import replace
