@@ -40,11 +40,11 @@ def predict_enlarged(predictor: Predictor, views: ViewBatch, near: float, far: f
     size = network_size(predictor.model, height, width)
     if size == (height, width):
         return predictor.predict_views(views, near, far)
-    smaller = replace(views, images=resize_images(views.images, *size), copies=())
-    return enlarge(predictor.predict_views(smaller, near, far), smaller.images, views)
+    smaller = replace(views, images=_resize(views.images, *size), copies=())
+    return _enlarge(predictor.predict_views(smaller, near, far), smaller.images, views)
 
 
-def enlarge(prediction: Prediction, images: np.ndarray, views: ViewBatch) -> Prediction:
+def _enlarge(prediction: Prediction, images: np.ndarray, views: ViewBatch) -> Prediction:
     """A prediction from smaller images [views, 3, h, w] at the size of the views' images."""
     height, width = views.images.shape[2:]
     _, small_height, small_width = prediction.depth.shape
@@ -61,14 +61,11 @@ def enlarge(prediction: Prediction, images: np.ndarray, views: ViewBatch) -> Pre
     return Prediction(depth, gaussians, prediction.seconds, cameras)
 
 
-def resize_images(images: np.ndarray, height: int, width: int) -> np.ndarray:
+def _resize(images: np.ndarray, height: int, width: int) -> np.ndarray:
     """Images [views, 3, h, w] at a smaller size, float32 [views, 3, height, width]."""
-    return np.stack([_resize(image, height, width) for image in images])
-
-
-def _resize(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    rows = np.ascontiguousarray(image.transpose(1, 2, 0))
-    return cv2.resize(rows, (width, height), interpolation=cv2.INTER_AREA).transpose(2, 0, 1)
+    rows = [np.ascontiguousarray(image.transpose(1, 2, 0)) for image in images]
+    resized = [cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA) for image in rows]
+    return np.stack(resized).transpose(0, 3, 1, 2)
 
 
 def _interpolate(depth: np.ndarray, height: int, width: int) -> np.ndarray:
