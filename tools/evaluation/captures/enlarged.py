@@ -1,12 +1,13 @@
-"""Predictions from larger images beside those from images of the trained size, enlarged.
+"""Predictions from larger images beside those from smaller ones, enlarged.
 
     python -P -m idesplat.tools.evaluation.captures.enlarged --checkouts DIR
 
 Both render the held-out frames of the triples. What the smaller images give is enlarged by bicubic interpolation to the
-larger frame, and rendered at its size, too. Only pixels that both frames show are compared. The larger size is turned
-for portrait frames.
+larger frame, and rendered at its size, too. Only pixels that both frames show are compared. The sizes are turned for
+portrait frames.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -23,7 +24,7 @@ from ....runtime.reconstruction.quality import Quality
 from ....runtime.reconstruction.steps import make_plan
 from ....runtime.splats.filtering import FilterOptions
 from ..cases import PosedImages
-from ..metrics import psnr
+from ..metrics import psnr, ssim
 from ..novel_views import render_target
 from ..report import print_table
 from .capture import Capture, CaptureImages, Triple, read_captures
@@ -40,10 +41,14 @@ def compare(
     capture: Annotated[list[str] | None, typer.Option(help="Use this capture alone; may be repeated.")] = None,
     model: Annotated[Path | None, typer.Option(help="An exported model; else the bundled one.")] = None,
     size: Annotated[str, typer.Option(help="HEIGHTxWIDTH of larger landscape frames.")] = "384x512",
+    smaller: Annotated[
+        str | None, typer.Option(help="HEIGHTxWIDTH of smaller ones; else the trained size.", show_default=False)
+    ] = None,
 ) -> None:
-    """Measure PSNR of held-out frames from two larger images, and from two of the trained size."""
-    larger = parse_size(size)
+    """Measure PSNR and SSIM of held-out frames from two larger images, and from two smaller ones."""
     predictor = Predictor(find_model(model))
+    own = predictor.metadata
+    sizes = parse_size(smaller) if smaller else (own.height, own.width), parse_size(size)
     plan = make_plan(Quality.STANDARD, predictor.model, "0", FilterOptions(), 0)
     evaluator = CaptureEvaluator(predictor, {}, plan)
     table = Table()
@@ -52,12 +57,12 @@ def compare(
         table.add_column(heading, justify="right")
     means = []
     for source in read_captures(capture or ()):
-        means.append(_capture_scores(evaluator, source, checkouts, larger))
-        cells = [f"{value:.2f}" for value in means[-1]]
+        means.append(_capture_scores(evaluator, source, checkouts, sizes))
+        cells = _cells(means[-1])
         table.add_row(source.name, *cells)
-        say(f"{source.name}: " + ", ".join(f"{name} {cell} dB" for name, cell in zip(COLUMNS, cells, strict=True)))
+        say(f"{source.name}: " + "; ".join(f"{name} {cell}" for name, cell in zip(COLUMNS, cells, strict=True)))
     table.add_section()
-    table.add_row(f"mean of {len(means)}", *(f"{value:.2f}" for value in np.mean(means, axis=0)))
+    table.add_row(f"mean of {len(means)}", *_cells(np.mean(means, axis=0)))
     print_table(table)
 
 
@@ -76,29 +81,33 @@ def enlarge(image: np.ndarray, targets: PosedImages, larger: PosedImages) -> tup
     return shown, inside > COVERED
 
 
+def _cells(scores: np.ndarray) -> list[str]:
+    """PSNR and SSIM of each column, [columns, 2], as text."""
+    return [f"{decibels:.2f} dB, {similarity:.3f}" for decibels, similarity in scores]
+
+
 def _capture_scores(
-    evaluator: CaptureEvaluator, source: Capture, checkouts: Path, larger: tuple[int, int]
+    evaluator: CaptureEvaluator, source: Capture, checkouts: Path, sizes: Sequence[tuple[int, int]]
 ) -> np.ndarray:
-    """The mean PSNR of a capture's triples, in the order of COLUMNS. larger: height and width of landscape frames."""
-    own = evaluator.predictor.metadata
+    """The means of a capture's triples, [columns, 2]. sizes: height and width of smaller and larger landscape ones."""
     camera = source.cameras[source.triples[0].target]
-    size = larger if camera.width >= camera.height else larger[::-1]
+    turned = [size if camera.width >= camera.height else size[::-1] for size in sizes]
     with frames_of(checkouts, source) as folder:
-        small, large = CaptureImages(source, folder, (own.height, own.width)), CaptureImages(source, folder, size)
+        small, large = (CaptureImages(source, folder, size) for size in turned)
         return np.mean([_triple_scores(evaluator, triple, small, large) for triple in source.triples], axis=0)
 
 
 def _triple_scores(
     evaluator: CaptureEvaluator, triple: Triple, small: CaptureImages, large: CaptureImages
-) -> list[float]:
-    """PSNR of a triple's held-out frame, in the order of COLUMNS."""
+) -> list[tuple[float, float]]:
+    """PSNR and SSIM of a triple's held-out frame, in the order of COLUMNS."""
     cases = [images.case(triple.context, [triple.target], evaluator.predictor.depth_range) for images in (small, large)]
     gaussians = [evaluator.predict(case).gaussians for case in cases]
     targets, larger = (case.targets for case in cases)
     enlarged, inside = enlarge(render_target(gaussians[0], targets, 0).rgb, targets, larger)
-    compared = inside & larger.valid[0]
+    truth, compared = larger.image(0), inside & larger.valid[0]
     images = (render_target(gaussians[1], larger, 0).rgb, enlarged, render_target(gaussians[0], larger, 0).rgb)
-    return [psnr(image, larger.image(0), compared) for image in images]
+    return [(psnr(image, truth, compared), ssim(image, truth, compared)) for image in images]
 
 
 def main() -> None:
