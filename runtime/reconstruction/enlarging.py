@@ -47,18 +47,19 @@ def predict_enlarged(predictor: Predictor, views: ViewBatch, near: float, far: f
 def _enlarge(prediction: Prediction, images: np.ndarray, views: ViewBatch) -> Prediction:
     """A prediction from smaller images [views, 3, h, w] at the size of the views' images."""
     height, width = views.images.shape[2:]
-    _, small_height, small_width = prediction.depth.shape
+    scale_y, scale_x = height / images.shape[2], width / images.shape[3]
     depth = np.stack([_interpolate(surface, height, width) for surface in prediction.depth])
-    scale_x, scale_y = width / small_width, height / small_height
     cameras = [
         replace(camera, width=width, height=height, K=scale_intrinsics(camera.K, scale_x, scale_y))
         for camera in prediction.cameras
     ]
-    gaussians = None if prediction.gaussians is None else _repeat(prediction.gaussians, prediction.depth, depth, views)
-    if gaussians is not None:
-        detail = views.images - _nearest(images, height, width)  # [views, 3, height, width]
-        gaussians.sh[:, 0] += detail.transpose(0, 2, 3, 1).reshape(-1, 3) / np.float32(SH_0)
-    return Prediction(depth, gaussians, prediction.seconds, cameras)
+    larger = replace(prediction, depth=depth, cameras=cameras)
+    if prediction.gaussians is None:
+        return larger
+    gaussians = _repeat(prediction.gaussians, prediction.depth, depth, views)
+    detail = views.images - _nearest(images, height, width)  # [views, 3, height, width]
+    gaussians.sh[:, 0] += detail.transpose(0, 2, 3, 1).reshape(-1, 3) / np.float32(SH_0)
+    return replace(larger, gaussians=gaussians)
 
 
 def _resize(images: np.ndarray, height: int, width: int) -> np.ndarray:
