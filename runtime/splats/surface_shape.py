@@ -13,8 +13,7 @@ What other views see through keeps its shape, as wrong surfaces should not hide 
 
 Where two views show one surface, their nearly opaque Gaussians compete: the layer that is nearer by a hair hides the
 other. With less opacity their colours mix. The more views show it, the more densely they sample it, so that less
-opaque and smaller Gaussians close it as well, and mix less of what their depths make disagree. With more than two views
-those of a surface have the area together that one view's have alone.
+opaque and smaller Gaussians close it as well, and mix less of what their depths make disagree.
 """
 
 from dataclasses import dataclass, replace
@@ -29,7 +28,9 @@ from .surfaces import Surfaces, project_to_pixel
 
 PAIR = 2  # views; the network was trained to predict Gaussians of two views that mix
 SHARED_OPACITY = 0.75  # of two views, what a Gaussian of a surface that both show keeps of its opacity
-TOTAL_OPACITY = 0.998  # of more views: that of opaque Gaussians of all views of a surface, one behind the other
+# With more views: 1 - the light that opaque Gaussians of all views of a surface let through together, and what a
+# Gaussian of such a surface keeps of its scales.
+TOTAL_OPACITY, SHARED_SCALE = 0.99, 0.75
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +83,7 @@ def mix_views(gaussians: Gaussians, votes: Votes, views: int) -> Gaussians:
         return replace(gaussians, opacities=gaussians.opacities * opacities.astype(np.float32))
     copies = votes.confirmed + 1
     opacities = np.where(shared, 1 - (1 - TOTAL_OPACITY) ** (1 / copies), 1) * copies / (copies + votes.seen_through)
-    scales = (copies**-0.5)[:, None].astype(np.float32)
+    scales = np.where(shared, SHARED_SCALE, 1)[:, None].astype(np.float32)
     return replace(
         gaussians,
         scales=gaussians.scales * scales,

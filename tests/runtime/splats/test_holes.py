@@ -237,13 +237,11 @@ def test_a_surface_of_one_view_stays_opaque(second: float | None) -> None:
 
 
 @pytest.mark.parametrize("views", [3, 4, 6])
-def test_all_views_of_a_surface_together_hide_and_cover_what_is_behind_it(views: int) -> None:
-    """They let 0.2 % of the light through, and have the area that one view's Gaussians have."""
+def test_all_views_of_a_surface_together_let_a_hundredth_of_the_light_through(views: int) -> None:
     before, surfaces = pixel_sized(np.concatenate([slanted(0)[None]] * views), extrinsics_in_a_row(*[0] * views))
     before.opacities[:] = 1
     after, _, _ = close_view(before, surfaces, np.ones((views, SIZE, SIZE), bool), 0)
-    np.testing.assert_allclose((1 - after.opacities) ** views, 0.002, rtol=1e-4)
-    np.testing.assert_allclose(views * after.scales**2, before.scales[: SIZE * SIZE] ** 2, rtol=1e-5)
+    np.testing.assert_allclose((1 - after.opacities) ** views, 0.01, rtol=1e-4)
 
 
 def test_of_many_views_one_that_sees_through_a_gaussian_takes_its_share_of_the_opacity() -> None:
