@@ -40,7 +40,7 @@ def predict_views(
 
     Where groups overlap, a view is predicted several times: of these, each pixel is the one that most views agree with.
     span: the depth range of all views. near, far: where they are given; else each group has its own depth range, which
-    is narrower, so that more depth candidates lie where its surfaces are. enlarge: whether the network gets images that
+    starts where its surfaces do, so that more depth candidates lie there. enlarge: whether the network gets images that
     are too large for it smaller (`enlarging`).
     """
     height, width = views.images.shape[2:]
@@ -103,12 +103,15 @@ def _choose(parts: list[list[Prediction]], views: ViewBatch, span: DepthRange) -
 def _own_range(
     predictor: Predictor, members: ViewBatch, span: DepthRange, near: float | None, far: float | None
 ) -> DepthRange:
-    """The depth range of a group; that of all views where the group's images do not tell it."""
+    """The depth range of a group; that of all views where the group's images do not tell it.
+
+    It ends no nearer than that of all views: a group's matches may all be on an object, with a plain wall behind it.
+    """
     try:
         found = predictor.depth_range(members, near, far)
     except InputError:  # a near that is given lies behind all that the group sees
         return span
-    return span if found.source.endswith(BASELINE) else found
+    return span if found.source.endswith(BASELINE) else replace(found, far=max(found.far, span.far))
 
 
 def voting_views(views: ViewBatch, span: DepthRange) -> list[np.ndarray]:

@@ -100,11 +100,19 @@ def test_every_group_has_its_own_depth_range_unless_it_is_given_or_unknown() -> 
     )
     many_views.predict_views(own, batch(7), SPAN)
     assert own.ranges == [(1.0 + int(names[0].partition(".")[0]), 30.0) for names in own.groups]
-    many_views.predict_views(given, batch(7), SPAN, near=2.0, far=9.0)
+    many_views.predict_views(given, batch(7), DepthRange(2.0, 9.0, "given"), near=2.0, far=9.0)
     assert set(given.ranges) == {(2.0, 9.0)}
     many_views.predict_views(unknown, batch(7), SPAN)
     many_views.predict_views(behind, batch(7), SPAN, near=40.0)
     assert set(unknown.ranges) == set(behind.ranges) == {(SPAN.near, SPAN.far)}
+
+
+def test_no_group_ends_nearer_than_all_views_do() -> None:
+    """Where a group's matches are all on an object, other views' tell how far away the wall behind it is."""
+    predictor = NumberingPredictor(True, 3)
+    many_views.predict_views(predictor, batch(7), replace(SPAN, far=80.0))
+    assert {far for _, far in predictor.ranges} == {80.0}
+    assert len({near for near, _ in predictor.ranges}) > 1
 
 
 class FailingPredictor(NumberingPredictor):
