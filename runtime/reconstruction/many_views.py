@@ -34,22 +34,23 @@ def predict_views(
     span: DepthRange,
     near: float | None = None,
     far: float | None = None,
-    enlarge: bool = False,
+    for_fusion: bool = False,
 ) -> Prediction:
     """Depth and Gaussians of all views, each predicted beside the views that suit it best.
 
     Where groups overlap, a view is predicted several times: of these, each pixel is the one that most views agree with.
     span: the depth range of all views. near, far: where they are given; else each group has its own depth range, which
-    starts where its surfaces do, so that more depth candidates lie there. enlarge: whether the network gets images that
-    are too large for it smaller (`enlarging`).
+    starts where its surfaces do, so that more depth candidates lie there. for_fusion: whether the result is fused, so
+    that more time may be spent: images that are too large for the network are given to it smaller (`enlarging`), and
+    each view is also predicted beside its best partner alone.
     """
     height, width = views.images.shape[2:]
     predict = predictor.predict_views
-    if enlarge:
+    if for_fusion:
         height, width = network_size(predictor.model, height, width)
         predict = partial(predict_enlarged, predictor)
     size = max(MIN_GROUP, min(max(predictor.metadata.trained_views), GROUP_PIXELS // (height * width)))
-    groups = group_views(views.cameras, _middle_depths(views, span), size)
+    groups = group_views(views.cameras, _middle_depths(views, span), size, pairs=for_fusion)
     if len(groups) == 1:
         return predict(views, span.near, span.far)
     range_of = partial(_own_range, predictor, span=span, near=near, far=far)

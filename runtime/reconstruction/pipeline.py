@@ -125,7 +125,7 @@ def reconstruct(
         placed, notes = apply_offset(exposed, offset, span.near)
         seconds = {"load": load_seconds, "prepare": prepared - started + time.perf_counter() - loaded}
         with working("predicting depth and Gaussians"):
-            prediction = predict_views(predictor, placed, span, near, far, enlarge=plan.fuses)
+            prediction = predict_views(predictor, placed, span, near, far, for_fusion=plan.fuses)
         LOG.info("predicted in %s", ", ".join(f"{name} {value:.2f} s" for name, value in prediction.seconds.items()))
         del predictor  # its memory is needed for the refinement, unless the caller keeps it open
         seconds |= prediction.seconds

@@ -19,29 +19,40 @@ TINY = np.finfo(np.float64).tiny
 
 @dataclass(frozen=True)
 class ViewGroup:
-    """Views that the network gets together, in rising order, and those of them whose prediction is used."""
+    """Views that the network gets together, in rising order.
+
+    used: those of them whose own group this is. What it predicts of the others is only chosen where it is better.
+    """
 
     views: tuple[int, ...]
     used: tuple[int, ...]
 
 
-def group_views(cameras: Sequence[Camera], depths: np.ndarray, size: int) -> list[ViewGroup]:
+def group_views(cameras: Sequence[Camera], depths: np.ndarray, size: int, pairs: bool = False) -> list[ViewGroup]:
     """Groups of at most `size` views so that each view is used once, beside the views that suit it best.
 
     Up to OWN_GROUPS views, each is grouped with its best partner and others up to MAX_COST, and equal groups are one.
     Of more views, a group grows from a view that has none yet: by the views without a group that make the best pairs
     with its own, and then by the best partner that each of these lacks. Where there is no room for that, the view waits
     for the next group.
-    size: 3 or more. depths: of the scene in each camera, [cameras].
+    size: 3 or more. depths: of the scene in each camera, [cameras]. pairs: whether up to OWN_GROUPS views also form
+    groups of each view and its best partner alone: a third view that sees little of a surface makes its depth worse.
     """
     count = len(cameras)
-    if count <= size:
-        return [ViewGroup(tuple(range(count)), tuple(range(count)))]
     cost = _pair_costs(cameras, depths)
-    if count <= OWN_GROUPS:
-        return _own_groups(cost, size)
+    if count <= size:
+        groups = [ViewGroup(tuple(range(count)), tuple(range(count)))]
+    elif count <= OWN_GROUPS:
+        groups = _own_groups(cost, size)
+    else:
+        return _shared_groups(cost, size)
+    return [*groups, *_best_pairs(cost, groups)] if pairs else groups
+
+
+def _shared_groups(cost: np.ndarray, size: int) -> list[ViewGroup]:
+    """Groups of at most `size` views that several views share as their own."""
     partners = cost.argmin(axis=1)
-    left, groups = set(range(count)), []
+    left, groups = set(range(len(cost))), []
     while left:
         members = _grow(cost, left, max(2, size - size // 3))
         lacking = dict.fromkeys(int(partners[view]) for view in members if partners[view] not in members)
@@ -59,6 +70,12 @@ def _own_groups(cost: np.ndarray, size: int) -> list[ViewGroup]:
         good = [other for other in others if cost[view, other] <= MAX_COST]
         used.setdefault(tuple(sorted({view, best, *good})), []).append(view)
     return [ViewGroup(views, tuple(own)) for views, own in used.items()]
+
+
+def _best_pairs(cost: np.ndarray, groups: Sequence[ViewGroup]) -> list[ViewGroup]:
+    """The pairs of each view and its best partner that are no group yet, as groups that are no view's own."""
+    pairs = {(min(view, best), max(view, best)) for view, best in enumerate(cost.argmin(axis=1).tolist())}
+    return [ViewGroup(pair, ()) for pair in sorted(pairs - {group.views for group in groups})]
 
 
 def nearest_views(cameras: Sequence[Camera], depths: np.ndarray, count: int) -> list[np.ndarray]:

@@ -127,7 +127,7 @@ def test_images_that_suit_the_network_are_predicted_as_they_are() -> None:
 @pytest.mark.parametrize("count", [2, 7])
 def test_all_groups_of_views_are_enlarged_if_asked(count: int) -> None:
     predictor, views, span = PlanePredictor(), large_views(count), DepthRange(1.0, 30.0, "given")
-    done = predict_views(predictor, views, span, enlarge=True)
+    done = predict_views(predictor, views, span, for_fusion=True)
     assert done.depth.shape == (count, HEIGHT, WIDTH) and len(done.need_gaussians()) == done.depth.size
     assert set(predictor.sizes) == {network_size(model(), HEIGHT, WIDTH)}
     predictor.sizes.clear()

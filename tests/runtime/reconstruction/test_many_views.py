@@ -37,7 +37,8 @@ class NumberingPredictor:
         self.gaussians, self.source = gaussians, source
         self.groups: list[list[str]] = []
         self.ranges: list[tuple[float, float]] = []
-        self.metadata = SimpleNamespace(trained_views=[2, trained_views])
+        self.metadata = SimpleNamespace(trained_views=[2, trained_views], height=HEIGHT, width=WIDTH, fixed_size=False)
+        self.model = SimpleNamespace(metadata=self.metadata)
 
     def depth_range(self, views: ViewBatch, near: float | None, far: float | None) -> DepthRange:
         """A range that the first image's number tells; none for a near beyond it, as the real one."""
@@ -138,6 +139,21 @@ def test_a_view_that_its_own_group_has_wrong_is_taken_from_another_group() -> No
     assert any("4.png" in names and "3.png" not in names for names in plain.groups), own
     prediction = many_views.predict_views(FailingPredictor("4.png", "3.png"), views, SPAN)
     np.testing.assert_array_equal(prediction.depth, 10.0)
+
+
+def test_a_view_that_a_third_view_spoils_is_taken_from_its_pair() -> None:
+    """Of three views only what is fused is also predicted in pairs, since that takes time."""
+    views = batch(3)
+    views.images[:] = 0.5
+    first, middle, last = (views.names.index(f"{number}.png") for number in range(3))
+
+    def predictor() -> FailingPredictor:
+        return FailingPredictor("0.png", "2.png")
+
+    plain = many_views.predict_views(predictor(), views, SPAN)
+    assert np.all(plain.depth[first] == 7) and np.all(plain.depth[[middle, last]] == 10)
+    fused = many_views.predict_views(predictor(), views, SPAN, for_fusion=True)
+    np.testing.assert_array_equal(fused.depth, 10.0)
 
 
 @pytest.mark.parametrize(("other_views", "most"), [(18, 3), (9, 2), (8, 1)])

@@ -39,6 +39,18 @@ def test_few_views_are_one_group() -> None:
     assert group.views == group.used == (0, 1, 2, 3, 4, 5)
 
 
+def test_each_view_is_also_in_a_pair_with_its_best_partner() -> None:
+    """Of three views in a row the middle one is the partner of both others; a pair that is a group is no second one."""
+    three = group_views(along(np.array([0.0, 0.8, 1.7])), np.full(3, 10.0), 3, pairs=True)
+    assert [(group.views, group.used) for group in three] == [((0, 1, 2), (0, 1, 2)), ((0, 1), ()), ((1, 2), ())]
+    (two,) = group_views(along(np.array([0.0, 0.8])), np.full(2, 10.0), 3, pairs=True)
+    assert two.views == two.used == (0, 1)
+    aside = group_views(along(np.array([0.0, 0.8, 1.6, 2.4, 9.0])), np.full(5, 10.0), 3, pairs=True)
+    assert [group.used for group in aside if group.views == (3, 4)] == [(4,)]
+    many = along(np.arange(25) * 0.8)
+    assert group_views(many, np.full(25, 10.0), 3, pairs=True) == group_views(many, np.full(25, 10.0), 3)
+
+
 def test_each_of_eight_views_is_beside_its_two_best_partners() -> None:
     """Along a path those are its neighbours, or at an end the next two; 25 views share groups."""
     positions = np.random.default_rng(0).permutation(np.arange(8) * 0.8)

@@ -151,7 +151,7 @@ class CaptureEvaluator:
         started = time.perf_counter()
         with reporting_to(None):
             views, exposure = compensate_exposure(views, self.exposure)
-            prediction = predict_views(self.predictor, views, span, enlarge=self.plan.fuses)
+            prediction = predict_views(self.predictor, views, span, for_fusion=self.plan.fuses)
             prediction = fuse(prediction, views, span, self.plan).prediction
             if self.plan.copy_side:
                 refined = refine_prediction(prediction, views, self.plan, None)
