@@ -8,7 +8,8 @@ import numpy as np
 from ..cameras.camera import Camera
 from .selection import score_pairs
 
-# Up to so many views, each gets a group of its own, with its best partners. That takes up to three times as long.
+# Up to so many views, each gets a group of its own, with its best partners. That takes up to three times as long; pairs
+# add at most one prediction of two views for each view.
 OWN_GROUPS = 24
 # Of a pair, beyond which a view makes the depth of a group of its own worse instead of better: a parallax of 25 degrees
 # at an overlap of 80 %, or of 10 degrees at 50 %.

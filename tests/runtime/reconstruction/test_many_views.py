@@ -146,13 +146,10 @@ def test_a_view_that_a_third_view_spoils_is_taken_from_its_pair() -> None:
     views = batch(3)
     views.images[:] = 0.5
     first, middle, last = (views.names.index(f"{number}.png") for number in range(3))
-
-    def predictor() -> FailingPredictor:
-        return FailingPredictor("0.png", "2.png")
-
-    plain = many_views.predict_views(predictor(), views, SPAN)
+    predictor = FailingPredictor("0.png", "2.png")
+    plain = many_views.predict_views(predictor, views, SPAN)
     assert np.all(plain.depth[first] == 7) and np.all(plain.depth[[middle, last]] == 10)
-    fused = many_views.predict_views(predictor(), views, SPAN, for_fusion=True)
+    fused = many_views.predict_views(predictor, views, SPAN, for_fusion=True)
     np.testing.assert_array_equal(fused.depth, 10.0)
 
 
