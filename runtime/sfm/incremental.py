@@ -12,9 +12,10 @@ import numpy as np
 from ..cameras.camera import Camera
 from ..cameras.formats.colmap import INSTALL, describe, observed_depths, to_camera
 from ..errors import InputError
-from ..system.files import scratch_folder
+from ..system.files import make_folder, scratch_folder
 from ..system.progress import progress, working
 from .features import match_features
+from .relief import reversed_relief
 
 if TYPE_CHECKING:
     import pycolmap
@@ -54,17 +55,31 @@ def run_incremental_sfm(images: "Sequence[UncalibratedImage]", refine_focal: boo
         with working("registering images"):
             pycolmap.geometric_verification(database_path)
             models = pycolmap.incremental_mapping(database_path, folder, folder, _options(refine_focal))
-    if not models:
+            best = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+            if best is not None and (reversed_model := reversed_relief(best, refine_focal)) is not None:
+                best = _continued(reversed_model, database_path, folder, refine_focal)
+    if best is None:
         raise InputError(
             f"--cameras estimate: none of the {len(images)} images could be registered; give more images that overlap, "
             "show texture, and are taken a step apart"
         )
     LOG.info("COLMAP's mapper made %d models of %d images", len(models), len(images))
-    best = max(models.values(), key=lambda model: model.num_reg_images())
     path_of = {_name(index): image.path for index, image in enumerate(images)}
     cameras = [to_camera({**found, "name": str(path_of[found["name"]])}) for found in describe(best)]
     depths = [observed_depths(best, image) for image in best.images.values() if image.has_pose]
     return cameras, _checked(np.concatenate([np.zeros(0), *depths]), len(cameras))
+
+
+def _continued(
+    model: "pycolmap.Reconstruction", database_path: Path, folder: Path, refine_focal: bool
+) -> "pycolmap.Reconstruction":
+    """The reconstruction with the images that it lacks, and the points that fit it: the mapper goes on from it."""
+    import pycolmap
+
+    start = make_folder(folder / "start")
+    model.write(start)
+    models = pycolmap.incremental_mapping(database_path, folder, folder, _options(refine_focal), start)
+    return max(models.values(), key=lambda model: model.num_reg_images(), default=model)
 
 
 def _checked(depths: np.ndarray, registered: int) -> np.ndarray:

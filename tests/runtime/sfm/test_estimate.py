@@ -73,6 +73,23 @@ def test_three_images_through_the_mapper(room):
         assert all(camera.depth_range is not None for camera in found)
 
 
+@pytest.mark.slow
+def test_the_mapper_goes_on_from_a_reconstruction_whose_relief_was_reversed(room, monkeypatch):
+    paths, known = room
+
+    def without_the_last(model, _):
+        """A part of the reconstruction, as `reversed_relief` gives it."""
+        model.deregister_frame(max(model.images.values(), key=lambda image: image.name).frame_id)
+        return model
+
+    monkeypatch.setattr(incremental, "reversed_relief", without_the_last)
+    found = estimate_cameras(paths, str(known[0].K[0, 0]))
+    assert [camera.name for camera in found] == [str(path) for path in paths]
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        rotation, direction = relative_errors(found, known, i, j)
+        assert rotation < 2 and direction < 5
+
+
 def test_exif_tells_the_focal_length(room, tmp_path):
     paths, known = room
     width, height = known[0].width, known[0].height
@@ -136,7 +153,7 @@ def test_a_reconstruction_without_points_in_front_of_the_cameras(monkeypatch, de
     """The median depth is the unit, so it must be one; COLMAP is replaced by what it would return."""
     model = SimpleNamespace(images={1: SimpleNamespace(has_pose=True)}, num_reg_images=lambda: 1)
     monkeypatch.setitem(sys.modules, "pycolmap", MagicMock(incremental_mapping=lambda *_: {0: model}))
-    replaced = {"_fill": None, "describe": [], "observed_depths": np.array(depths)}
+    replaced = {"_fill": None, "reversed_relief": None, "describe": [], "observed_depths": np.array(depths)}
     for name, value in replaced.items():
         monkeypatch.setattr(incremental, name, lambda *_, value=value: value)
     with pytest.raises(InputError, match=r"no points in front of them found, .*; give more images") as caught:
