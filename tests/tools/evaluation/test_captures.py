@@ -31,7 +31,7 @@ from idesplat.tools.evaluation.metrics import HIGHEST_PSNR, fit_exposure, psnr
 from idesplat.tools.evaluation.novel_views import render_target
 from one_capture import git, list_one_capture
 
-FROZEN = "7499431c77fc0ba0ed42c9999332d3d174ee2f662c1a1cc5606d8749d488e4ad"
+FROZEN = "80acbf9275524955671281f8624c836b5390a7f5a0c16d9198441bf9f610e824"
 TRAINED_ON = {"vork/maryRose", "alicevision/dataset_buddha"}
 KINDS = {"room", "object", "facade", "vegetation", "aerial"}
 REPOSITORY, FOLDER = "someone/photos", "some/images"

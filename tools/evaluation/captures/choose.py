@@ -48,6 +48,7 @@ def choose_captures(
     checkouts: Annotated[Path, typer.Option(help="Folder of checkouts; missing ones are cloned into it.")],
     work: Annotated[Path, typer.Option(help="Folder for images and estimated cameras, which are reused.")],
     capture: Annotated[list[str] | None, typer.Option(help="Choose for this capture alone; may be repeated.")] = None,
+    keep_frames: Annotated[bool, typer.Option(help="Make the cameras anew, of the frames in the file.")] = False,
 ) -> None:
     """Choose frames and write the package's captures.json; captures that are not named stay as they are."""
     before = json.loads(CAPTURES_FILE.read_text())["captures"] if CAPTURES_FILE.exists() else []
@@ -58,24 +59,32 @@ def choose_captures(
             raise InputError(f"--capture {name}: no such capture; expected one of {', '.join(order)}")
     for recipe in RECIPES:
         if not capture or recipe.name in capture:
-            entries[recipe.name] = _choose(recipe, checkouts, work)
+            chosen = entries[recipe.name] if keep_frames else None
+            entries[recipe.name] = _choose(recipe, checkouts, work, chosen)
             with atomic_write(CAPTURES_FILE) as temporary:
                 temporary.write_text(as_json([entries[name] for name in order if name in entries]))
     say(f"wrote {CAPTURES_FILE}: {len(entries)} captures")
 
 
-def _choose(recipe: Recipe, checkouts: Path, work: Path) -> dict[str, Any]:
-    """The entry of `captures.json` for a recipe; raises InputError if its frames give too few triples."""
+def _choose(recipe: Recipe, checkouts: Path, work: Path, chosen: dict[str, Any] | None = None) -> dict[str, Any]:
+    """The entry of `captures.json` for a recipe; raises InputError if its frames give too few triples.
+
+    chosen: an entry whose frames are kept.
+    """
     images, cameras = _frames(recipe, checkouts, make_folder(work / recipe.name))
     pairs = match_images_to_cameras(images, cameras)
     pairs = [(path, replace(camera, name=path.name)) for path, camera in pairs]
     survey = cached_survey(work / recipe.name / "survey.npz", pairs)
     good = np.flatnonzero(survey.error < MAX_EPIPOLAR_PX)
     extrinsics = np.stack([camera.extrinsics for _, camera in pairs])
-    triples, views, between = _select(extrinsics, survey, good, EpipolarErrors(pairs))
+    names = [path.name for path, _ in pairs]
+    if chosen is None:
+        triples, views, between = _select(extrinsics, survey, good, EpipolarErrors(pairs))
+    else:
+        triples = [(names.index(a), names.index(b), names.index(target)) for a, b, target in chosen["triples"]]
+        views, between = ([names.index(name) for name in chosen[field]] for field in ("views", "between"))
     if len(triples) < TRIPLES:
         raise InputError(f"{recipe.name}: {len(triples)} triples found, expected {TRIPLES}; leave the capture out")
-    names = [path.name for path, _ in pairs]
     used = sorted({*np.ravel(triples).tolist(), *views, *between})
     baselines = [float(survey.baseline[a, b]) for a, b, _ in triples]
     say(
