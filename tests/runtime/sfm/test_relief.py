@@ -1,10 +1,10 @@
 """The choice between a relief and its reversal, on reconstructions whose true cameras are known."""
 
 import numpy as np
-import pycolmap
 import pytest
 from idesplat.runtime.sfm.relief import _adjust, _error, _reverse, reversed_relief
 
+pycolmap = pytest.importorskip("pycolmap")
 WIDTH, HEIGHT, FOCAL = 640, 480, 560.0
 NOISE = 0.2  # pixels, of a measured point
 
