@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..cameras.camera import Camera
-from ..cameras.formats.colmap import INSTALL, describe, observed_depths, to_camera
+from ..cameras.formats.colmap import INSTALL, describe, observed_depths, registered_images, to_camera
 from ..errors import InputError
 from ..system.files import make_folder, scratch_folder
 from ..system.progress import progress, working
@@ -54,32 +54,36 @@ def run_incremental_sfm(images: "Sequence[UncalibratedImage]", refine_focal: boo
         _fill(database_path, images)
         with working("registering images"):
             pycolmap.geometric_verification(database_path)
-            models = pycolmap.incremental_mapping(database_path, folder, folder, _options(refine_focal))
-            best = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
-            if best is not None and (reversed_model := reversed_relief(best, refine_focal)) is not None:
-                best = _continued(reversed_model, database_path, folder, refine_focal)
+            best = _map(database_path, folder, refine_focal)
+            if best is not None and (other := reversed_relief(best, refine_focal)) is not None:
+                best = _map(database_path, folder, refine_focal, other)
     if best is None:
         raise InputError(
             f"--cameras estimate: none of the {len(images)} images could be registered; give more images that overlap, "
             "show texture, and are taken a step apart"
         )
-    LOG.info("COLMAP's mapper made %d models of %d images", len(models), len(images))
     path_of = {_name(index): image.path for index, image in enumerate(images)}
     cameras = [to_camera({**found, "name": str(path_of[found["name"]])}) for found in describe(best)]
-    depths = [observed_depths(best, image) for image in best.images.values() if image.has_pose]
+    depths = [observed_depths(best, image) for image in registered_images(best)]
     return cameras, _checked(np.concatenate([np.zeros(0), *depths]), len(cameras))
 
 
-def _continued(
-    model: "pycolmap.Reconstruction", database_path: Path, folder: Path, refine_focal: bool
-) -> "pycolmap.Reconstruction":
-    """The reconstruction with the images that it lacks, and the points that fit it: the mapper goes on from it."""
+def _map(
+    database_path: Path, folder: Path, refine_focal: bool, start: "pycolmap.Reconstruction | None" = None
+) -> "pycolmap.Reconstruction | None":
+    """The reconstruction of most images that the mapper makes, or `start` or None if it makes none.
+
+    folder: gets what it writes. start: a reconstruction that it adds the other images and points to.
+    """
     import pycolmap
 
-    start = make_folder(folder / "start")
-    model.write(start)
-    models = pycolmap.incremental_mapping(database_path, folder, folder, _options(refine_focal), start)
-    return max(models.values(), key=lambda model: model.num_reg_images(), default=model)
+    given: Path | str = ""
+    if start is not None:
+        given = make_folder(folder / "start")
+        start.write(given)
+    models = pycolmap.incremental_mapping(database_path, folder, folder, _options(refine_focal), given)
+    LOG.info("COLMAP's mapper made %d models", len(models))
+    return max(models.values(), key=lambda model: model.num_reg_images(), default=start)
 
 
 def _checked(depths: np.ndarray, registered: int) -> np.ndarray:

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..cameras.formats.colmap import registered_images
+
 if TYPE_CHECKING:
     import pycolmap
 
@@ -57,7 +59,7 @@ def reversed_relief(model: "pycolmap.Reconstruction", refine_focal: bool) -> "py
 
 def _reduce(model: "pycolmap.Reconstruction") -> None:
     """Keep images spread over those that see what the one in the middle sees, and the points that most of them see."""
-    images = _in_order(model)
+    images = registered_images(model)
     middle = _points(images[len(images) // 2])
     near = [image for image in images if len(middle & _points(image)) >= MIN_SHARED * len(middle)]
     places = np.unique(np.linspace(0, len(near) - 1, min(IMAGES, len(near))).round().astype(int))
@@ -83,7 +85,7 @@ def _reverse(model: "pycolmap.Reconstruction") -> None:
     """
     import pycolmap
 
-    images = _in_order(model)
+    images = registered_images(model)
     middle = images[len(images) // 2].cam_from_world()
     in_middle = np.stack([middle * point.xyz for point in model.points3D.values()])
     centre = float(np.median(in_middle[:, 2]))
@@ -97,17 +99,12 @@ def _reverse(model: "pycolmap.Reconstruction") -> None:
         model.frame(image.frame_id).set_cam_from_world(image.camera_id, turned)
 
 
-def _in_order(model: "pycolmap.Reconstruction") -> "list[pycolmap.Image]":
-    """The images that have a pose, by name."""
-    return sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
-
-
 def _adjust(model: "pycolmap.Reconstruction", refine_focal: bool) -> None:
     """Bundle adjustment with a robust loss, first with the cameras' focal lengths as they are."""
     import pycolmap
 
     config = pycolmap.BundleAdjustmentConfig()
-    for image in _in_order(model):
+    for image in registered_images(model):
         config.add_image(image.image_id)
     for refine in (False, True) if refine_focal else (False,):
         options = pycolmap.BundleAdjustmentOptions()

@@ -187,10 +187,9 @@ def to_camera(image: dict[str, Any]) -> Camera:
 
 def describe(reconstruction: "pycolmap.Reconstruction") -> list[dict[str, Any]]:
     """The registered images of a model, sorted by name, as JSON values for `to_camera`."""
-    images = [image for image in reconstruction.images.values() if image.has_pose]
     found = []
-    for image in sorted(images, key=lambda image: image.name):
-        camera = image.camera
+    for image in registered_images(reconstruction):
+        camera = reconstruction.camera(image.camera_id)
         found.append(
             {
                 "name": image.name,
@@ -203,6 +202,11 @@ def describe(reconstruction: "pycolmap.Reconstruction") -> list[dict[str, Any]]:
             }
         )
     return found
+
+
+def registered_images(reconstruction: "pycolmap.Reconstruction") -> "list[pycolmap.Image]":
+    """The images of a model that have a pose, sorted by name."""
+    return sorted((image for image in reconstruction.images.values() if image.has_pose), key=lambda image: image.name)
 
 
 def observed_depths(reconstruction: "pycolmap.Reconstruction", image: "pycolmap.Image") -> np.ndarray:

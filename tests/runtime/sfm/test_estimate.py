@@ -151,7 +151,7 @@ def test_refusals(room, tmp_path, monkeypatch):
 @pytest.mark.parametrize("depths", [[], [np.nan, np.nan], [-1.0, -2.0]])
 def test_a_reconstruction_without_points_in_front_of_the_cameras(monkeypatch, depths):
     """The median depth is the unit, so it must be one; COLMAP is replaced by what it would return."""
-    model = SimpleNamespace(images={1: SimpleNamespace(has_pose=True)}, num_reg_images=lambda: 1)
+    model = SimpleNamespace(images={1: SimpleNamespace(has_pose=True, name="000000")}, num_reg_images=lambda: 1)
     monkeypatch.setitem(sys.modules, "pycolmap", MagicMock(incremental_mapping=lambda *_: {0: model}))
     replaced = {"_fill": None, "reversed_relief": None, "describe": [], "observed_depths": np.array(depths)}
     for name, value in replaced.items():
