@@ -373,6 +373,25 @@ def test_an_unknown_capture_is_refused_before_anything_is_read(module: Any, tmp_
     assert not list(tmp_path.iterdir())
 
 
+def test_frames_can_only_be_kept_of_a_capture_that_was_chosen(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Capsys
+) -> None:
+    file = tmp_path / "captures.json"
+    file.write_text('{"captures": []}')
+    monkeypatch.setattr(choose, "CAPTURES_FILE", file)
+    options = ("--checkouts", tmp_path / "none", "--work", tmp_path / "work", "--capture", "city", "--keep-frames")
+    assert run_command(choose.main, *options) == 2
+    assert "has no frames of city; choose them first" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_a_kept_frame_needs_a_camera() -> None:
+    chosen = {"name": "room", "triples": [["a", "c", "b"]], "views": ["a", "c"], "between": ["b"]}
+    assert choose.kept_frames(chosen, ["a", "b", "c"]) == ([(0, 2, 1)], [0, 2], [1])
+    with pytest.raises(InputError, match="room: frame b got no camera; choose without --keep-frames"):
+        choose.kept_frames(chosen, ["a", "c"])
+
+
 def test_pixels_outside_the_lens_image_are_invalid(capture_file: Path, scene: Path) -> None:
     content = json.loads(capture_file.read_text())
     content["captures"][0]["lenses"][0]["distortion"] = [0.3, 0.0, 0.0, 0.0]  # the corners lie outside

@@ -57,12 +57,15 @@ def choose_captures(
     for name in capture or ():
         if name not in order:
             raise InputError(f"--capture {name}: no such capture; expected one of {', '.join(order)}")
-    for recipe in RECIPES:
-        if not capture or recipe.name in capture:
-            chosen = entries[recipe.name] if keep_frames else None
-            entries[recipe.name] = _choose(recipe, checkouts, work, chosen)
-            with atomic_write(CAPTURES_FILE) as temporary:
-                temporary.write_text(as_json([entries[name] for name in order if name in entries]))
+    recipes = [recipe for recipe in RECIPES if not capture or recipe.name in capture]
+    for recipe in recipes if keep_frames else ():
+        if recipe.name not in entries:
+            raise InputError(f"--keep-frames: {CAPTURES_FILE} has no frames of {recipe.name}; choose them first")
+    for recipe in recipes:
+        chosen = entries[recipe.name] if keep_frames else None
+        entries[recipe.name] = _choose(recipe, checkouts, work, chosen)
+        with atomic_write(CAPTURES_FILE) as temporary:
+            temporary.write_text(as_json([entries[name] for name in order if name in entries]))
     say(f"wrote {CAPTURES_FILE}: {len(entries)} captures")
 
 
@@ -81,8 +84,7 @@ def _choose(recipe: Recipe, checkouts: Path, work: Path, chosen: dict[str, Any] 
     if chosen is None:
         triples, views, between = _select(extrinsics, survey, good, EpipolarErrors(pairs))
     else:
-        triples = [(names.index(a), names.index(b), names.index(target)) for a, b, target in chosen["triples"]]
-        views, between = ([names.index(name) for name in chosen[field]] for field in ("views", "between"))
+        triples, views, between = kept_frames(chosen, names)
     if len(triples) < TRIPLES:
         raise InputError(f"{recipe.name}: {len(triples)} triples found, expected {TRIPLES}; leave the capture out")
     used = sorted({*np.ravel(triples).tolist(), *views, *between})
@@ -102,6 +104,21 @@ def _choose(recipe: Recipe, checkouts: Path, work: Path, chosen: dict[str, Any] 
         "views": [names[index] for index in views],
         "between": [names[index] for index in between],
     }
+
+
+def kept_frames(
+    chosen: dict[str, Any], names: Sequence[str]
+) -> tuple[list[tuple[int, int, int]], list[int], list[int]]:
+    """The triples, views and frames between them of an entry, as indices into the names of the frames with a camera.
+
+    Raises InputError for a frame that has none.
+    """
+    lost = {*np.ravel(chosen["triples"]).tolist(), *chosen["views"], *chosen["between"]} - set(names)
+    if lost:
+        raise InputError(f"{chosen['name']}: frame {min(lost)} got no camera; choose without --keep-frames")
+    triples = [(names.index(a), names.index(b), names.index(target)) for a, b, target in chosen["triples"]]
+    views, between = ([names.index(name) for name in chosen[field]] for field in ("views", "between"))
+    return triples, views, between
 
 
 def _select(
