@@ -70,7 +70,8 @@ def estimate_cameras(
         raise InputError(skipped_lines[0])
     if len(usable) < 2:
         why = f" that can be used ({skipped_lines[0]})" if skipped_lines else " given"
-        raise InputError(f"--cameras estimate: {len(usable)} image{why}, expected two at least; add images")
+        count = "1 image" if usable else "no image"
+        raise InputError(f"--cameras estimate: {count}{why}, expected two at least; add images")
     if skipped is not None:
         skipped += skipped_lines
     if len(usable) > 2:

@@ -3,6 +3,7 @@
 import importlib.util
 import logging
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,8 +25,26 @@ if TYPE_CHECKING:
 
 LOG = logging.getLogger(__name__)
 
+
+@dataclass(frozen=True)
+class Start:
+    """What the mapper takes for an unknown focal length, in longer image sides. held: it is not refined."""
+
+    focal: float
+    held: bool = False
+
+
 CAMERA_MODEL = "SIMPLE_RADIAL"
-INITIAL_FOCAL = 1.0  # in longer image sides, where the focal length is unknown
+# Where focal lengths are unknown, the mapper starts from one, in longer image sides, and refines it. From a wrong one
+# it may register two images or none; then it starts again from the next, and the last, a usual one, is held.
+STARTS = (Start(1.0), Start(0.75), Start(1.5), Start(0.8, held=True))
+# Few images do not determine a focal length as well as EXIF data tell it: of up to so many it is held.
+MAX_HELD = 8
+# A start is good if more than this share of the images is registered, or so many.
+GOOD_SHARE, GOOD_COUNT = 0.75, 10
+# A registered image counts if it sees so many points, with a focal length between these, in longer image sides.
+MIN_IMAGE_POINTS = 20
+MIN_FOCAL, MAX_FOCAL = 0.35, 3.5
 MAX_EXHAUSTIVE = 20  # images that are matched exhaustively; more are matched with these next ones in order
 SEQUENTIAL_OFFSETS = (1, 2, 3, 4, 6, 8, 12, 16)
 MIN_MATCHES = 30
@@ -43,7 +62,7 @@ def check_pycolmap(images: int) -> None:
 def run_incremental_sfm(images: "Sequence[UncalibratedImage]", refine_focal: bool) -> tuple[list[Camera], np.ndarray]:
     """The cameras of the registered images, in an arbitrary world frame and unit, and the depths of their points.
 
-    refine_focal: refine known focal lengths, too.
+    refine_focal: refine known focal lengths, too, if there are more than MAX_HELD images.
     Raises InputError if no reconstruction is found.
     """
     import pycolmap
@@ -53,10 +72,8 @@ def run_incremental_sfm(images: "Sequence[UncalibratedImage]", refine_focal: boo
         database_path = folder / "database.db"
         _fill(database_path, images)
         with working("registering images"):
-            pycolmap.geometric_verification(database_path)
-            best = _map(database_path, folder, refine_focal)
-            if best is not None and (other := reversed_relief(best, refine_focal)) is not None:
-                best = _map(database_path, folder, refine_focal, other)
+            _verify(database_path)
+            best = _reconstruct(database_path, folder, images, refine_focal)
     if best is None:
         raise InputError(
             f"--cameras estimate: none of the {len(images)} images could be registered; give more images that overlap, "
@@ -66,6 +83,43 @@ def run_incremental_sfm(images: "Sequence[UncalibratedImage]", refine_focal: boo
     cameras = [to_camera({**found, "name": str(path_of[found["name"]])}) for found in describe(best)]
     depths = [observed_depths(best, image) for image in registered_images(best)]
     return cameras, _checked(np.concatenate([np.zeros(0), *depths]), len(cameras))
+
+
+def _reconstruct(
+    database_path: Path, folder: Path, images: "Sequence[UncalibratedImage]", refine_focal: bool
+) -> "pycolmap.Reconstruction | None":
+    """The reconstruction from the known focal lengths, or the best from those of STARTS, up to the first good one."""
+    if all(image.focal is not None for image in images):
+        return _map_right_relief(database_path, folder, refine_focal and len(images) > MAX_HELD)
+    best = None
+    for start in STARTS:
+        _set_unknown_focals(database_path, start.focal)
+        found = _map_right_relief(database_path, folder, refine_focal and not start.held)
+        best = max(best, found, key=_usable)
+        registered, points = _usable(best)
+        LOG.info("from a focal length of %.2f sides, best: %d images, %d points", start.focal, registered, points)
+        if registered > GOOD_SHARE * len(images) or registered >= GOOD_COUNT:
+            break
+    return best
+
+
+def _usable(model: "pycolmap.Reconstruction | None") -> tuple[int, int]:
+    """The number of images that count, and of points, of a reconstruction."""
+    if model is None:
+        return 0, 0
+    count = 0
+    for image in registered_images(model):
+        camera = model.cameras[image.camera_id]
+        focal = camera.focal_length / max(camera.width, camera.height)
+        count += image.num_points3D >= MIN_IMAGE_POINTS and MIN_FOCAL < focal < MAX_FOCAL
+    return count, model.num_points3D()
+
+
+def _map_right_relief(database_path: Path, folder: Path, refine_focal: bool) -> "pycolmap.Reconstruction | None":
+    """What the mapper makes, or makes from the reversed relief if that fits better; None if it makes nothing."""
+    found = _map(database_path, folder, refine_focal)
+    other = None if found is None else reversed_relief(found, refine_focal)
+    return found if other is None else _map(database_path, folder, refine_focal, other)
 
 
 def _map(
@@ -125,7 +179,7 @@ def _write_camera(database: "pycolmap.Database", image: "UncalibratedImage") -> 
     import pycolmap
 
     width, height = image.width, image.height
-    focal = image.focal or INITIAL_FOCAL * max(width, height)
+    focal = image.focal or STARTS[0].focal * max(width, height)
     camera = pycolmap.Camera(model=CAMERA_MODEL, width=width, height=height, params=[focal, width / 2, height / 2, 0.0])
     camera.has_prior_focal_length = image.focal is not None
     return int(database.write_camera(camera))
@@ -134,6 +188,26 @@ def _write_camera(database: "pycolmap.Database", image: "UncalibratedImage") -> 
 def _pairs(count: int) -> list[tuple[int, int]]:
     """The pairs of images to match."""
     return [(i, j) for i, j in combinations(range(count), 2) if count <= MAX_EXHAUSTIVE or j - i in SEQUENTIAL_OFFSETS]
+
+
+def _set_unknown_focals(database_path: Path, sides: float) -> None:
+    """Set the focal lengths that are not known, in longer image sides."""
+    import pycolmap
+
+    with pycolmap.Database.open(database_path) as database:
+        for camera in database.read_all_cameras():
+            if not camera.has_prior_focal_length:
+                camera.focal_length = sides * max(camera.width, camera.height)
+                database.update_camera(camera)
+
+
+def _verify(database_path: Path) -> None:
+    """Find the matches that fit a relative pose, the same ones in each run."""
+    import pycolmap
+
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = SEED
+    pycolmap.geometric_verification(database_path, two_view_geometry_options=options)
 
 
 def _options(refine_focal: bool) -> "pycolmap.IncrementalPipelineOptions":

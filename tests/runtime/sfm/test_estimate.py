@@ -13,6 +13,7 @@ from idesplat.runtime.images.exif import exif_focal, parse_focal
 from idesplat.runtime.images.io import load_image
 from idesplat.runtime.sfm import incremental
 from idesplat.runtime.sfm.estimate import estimate_cameras
+from idesplat.runtime.sfm.incremental import Start
 from idesplat.tools.synthetic.make_scene import make_scene
 from PIL import Image
 
@@ -90,20 +91,28 @@ def test_the_mapper_goes_on_from_a_reconstruction_whose_relief_was_reversed(room
         assert rotation < 2 and direction < 5
 
 
-def test_exif_tells_the_focal_length(room, tmp_path):
+@pytest.fixture(scope="module")
+def tagged(room, tmp_path_factory):
+    """The room's images with the focal length in their EXIF data, in whole millimetres."""
     paths, known = room
-    width, height = known[0].width, known[0].height
-    film = round(known[0].K[0, 0] * np.hypot(36, 24) / np.hypot(width, height))
-    tagged = []
-    for path in (paths[0], paths[2]):
+    folder = tmp_path_factory.mktemp("tagged")
+    film = round(known[0].K[0, 0] * np.hypot(36, 24) / np.hypot(known[0].width, known[0].height))
+    written = []
+    for path in paths:
         image = Image.open(path)
         exif = image.getexif()
         exif.get_ifd(0x8769)[FOCAL_LENGTH_35MM] = film
-        tagged.append(tmp_path / f"{path.stem}.jpg")
-        image.save(tagged[-1], exif=exif, quality=98)
+        written.append(folder / f"{path.stem}.jpg")
+        image.save(written[-1], exif=exif, quality=98)
+    return written
+
+
+def test_exif_tells_the_focal_length(room, tagged):
+    paths, known = room
+    width, height = known[0].width, known[0].height
     assert exif_focal(tagged[0], width, height) == pytest.approx(known[0].K[0, 0], rel=0.02)  # whole millimetres
     assert exif_focal(paths[0], width, height) is None
-    rotation, direction = relative_errors(estimate_cameras(tagged), [known[0], known[2]])
+    rotation, direction = relative_errors(estimate_cameras([tagged[0], tagged[2]]), [known[0], known[2]])
     assert rotation < 2 and direction < 5
 
 
@@ -148,12 +157,59 @@ def test_refusals(room, tmp_path, monkeypatch):
         estimate_cameras([first, second, blank], focal)
 
 
+@pytest.mark.slow
+def test_a_start_that_is_held_is_the_focal_length_in_each_run(room, monkeypatch):
+    paths, known = room
+    start = Start(1.1 * known[0].K[0, 0] / known[0].width, held=True)
+    monkeypatch.setattr(incremental, "STARTS", [start])
+    found, again = estimate_cameras(paths), estimate_cameras(paths)
+    assert [camera.name for camera in found] == [str(path) for path in paths]
+    assert found[0].K[0, 0] == pytest.approx(start.focal * known[0].width, rel=1e-9)
+    for one, other in zip(found, again, strict=True):
+        np.testing.assert_array_equal(one.extrinsics, other.extrinsics)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("most", "held"), [(3, True), (2, False)])
+def test_the_mapper_holds_known_focal_lengths_of_few_images(room, tagged, monkeypatch, most, held):
+    monkeypatch.setattr(incremental, "MAX_HELD", most)
+    film = exif_focal(tagged[0], *reversed(load_image(tagged[0]).shape[:2]))
+    assert (estimate_cameras(tagged)[0].K[0, 0] == pytest.approx(film, rel=1e-6)) == held
+
+
+def model(registered, points, focal):
+    """As much of a reconstruction as is needed to compare it."""
+    image = SimpleNamespace(has_pose=True, name="0", camera_id=1, num_points3D=points)
+    camera = SimpleNamespace(focal_length=focal, width=100, height=50)
+    images = dict(enumerate([image] * registered))
+    return SimpleNamespace(images=images, cameras={1: camera}, num_points3D=lambda: points)
+
+
+@pytest.mark.parametrize(
+    ("found", "best", "tried"),
+    [
+        ([model(4, 100, 90)], 0, 1),
+        ([None, model(3, 100, 90), model(4, 50, 90)], 2, 3),  # three of four are not more than GOOD_SHARE
+        ([model(4, 100, 1000), model(2, 100, 90), None, model(2, 80, 90)], 1, 4),  # 1000 pixels are implausible
+        ([None, model(4, 0, 90), None, None], 0, 4),  # without points it is none
+        ([None] * 4, 0, 4),
+    ],
+)
+def test_the_best_reconstruction_is_kept(found, best, tried, monkeypatch):
+    left = list(found)
+    monkeypatch.setattr(incremental, "_set_unknown_focals", lambda *_: None)
+    monkeypatch.setattr(incremental, "_map_right_relief", lambda *_: left.pop(0))
+    images = [SimpleNamespace(focal=None)] * 4
+    assert incremental._reconstruct("database", "folder", images, refine_focal=True) is found[best]
+    assert len(found) - len(left) == tried
+
+
 @pytest.mark.parametrize("depths", [[], [np.nan, np.nan], [-1.0, -2.0]])
 def test_a_reconstruction_without_points_in_front_of_the_cameras(monkeypatch, depths):
     """The median depth is the unit, so it must be one; COLMAP is replaced by what it would return."""
-    model = SimpleNamespace(images={1: SimpleNamespace(has_pose=True, name="000000")}, num_reg_images=lambda: 1)
-    monkeypatch.setitem(sys.modules, "pycolmap", MagicMock(incremental_mapping=lambda *_: {0: model}))
-    replaced = {"_fill": None, "reversed_relief": None, "describe": [], "observed_depths": np.array(depths)}
+    monkeypatch.setitem(sys.modules, "pycolmap", MagicMock())
+    found = model(1, 0, 90)
+    replaced = {"_fill": None, "_reconstruct": found, "describe": [], "observed_depths": np.array(depths)}
     for name, value in replaced.items():
         monkeypatch.setattr(incremental, name, lambda *_, value=value: value)
     with pytest.raises(InputError, match=r"no points in front of them found, .*; give more images") as caught:
