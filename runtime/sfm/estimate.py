@@ -55,7 +55,8 @@ def estimate_cameras(
     """Estimate the cameras of images of one static scene; of more than two images, of those that can be registered.
 
     focal: the focal length of all images, in pixels (1375 or `1375`) or equivalent to 35 mm film (`26mm`). By default
-    it is read from each image's EXIF data; with more than two images it is estimated where these lack it.
+    it is read from each image's EXIF data, and refined if these are many; with more than two images it is estimated
+    where these lack it.
     skipped: receives a line for each damaged or duplicate image, which is then left out; if None, such an image raises.
     decoded: receives the decoded images, up to DECODED_BYTES.
     Returns cameras in the frame of the first one, in a unit in which the median depth is 1, with `depth_range`.

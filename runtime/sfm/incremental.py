@@ -28,18 +28,18 @@ LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Start:
-    """What the mapper takes for an unknown focal length, in longer image sides. held: it is not refined."""
+    """How the mapper starts. held: focal lengths are not refined. focal: of those unknown, in longer image sides."""
 
-    focal: float
     held: bool = False
+    focal: float = 1.0
 
 
 CAMERA_MODEL = "SIMPLE_RADIAL"
-# Where focal lengths are unknown, the mapper starts from one, in longer image sides, and refines it. From a wrong one
-# it may register two images or none; then it starts again from the next, and the last, a usual one, is held.
-STARTS = (Start(1.0), Start(0.75), Start(1.5), Start(0.8, held=True))
-# Few images do not determine a focal length as well as EXIF data tell it: of up to so many it is held.
-MAX_HELD = 8
+# Where focal lengths are unknown, the mapper starts from one and refines it. From a wrong one it may register two
+# images or none; then it starts again from the next, and the last, a usual one, is held.
+UNKNOWN_STARTS = (Start(focal=1.0), Start(focal=0.75), Start(focal=1.5), Start(focal=0.8, held=True))
+# Few images do not determine a focal length as well as EXIF data tell it: of up to so many it is held at first.
+MAX_HELD = 6
 # A start is good if more than this share of the images is registered, or so many.
 GOOD_SHARE, GOOD_COUNT = 0.75, 10
 # A registered image counts if it sees so many points, with a focal length between these, in longer image sides.
@@ -62,7 +62,7 @@ def check_pycolmap(images: int) -> None:
 def run_incremental_sfm(images: "Sequence[UncalibratedImage]", refine_focal: bool) -> tuple[list[Camera], np.ndarray]:
     """The cameras of the registered images, in an arbitrary world frame and unit, and the depths of their points.
 
-    refine_focal: refine known focal lengths, too, if there are more than MAX_HELD images.
+    refine_focal: refine known focal lengths, too: at first only of more than MAX_HELD images.
     Raises InputError if no reconstruction is found.
     """
     import pycolmap
@@ -73,7 +73,7 @@ def run_incremental_sfm(images: "Sequence[UncalibratedImage]", refine_focal: boo
         _fill(database_path, images)
         with working("registering images"):
             _verify(database_path)
-            best = _reconstruct(database_path, folder, images, refine_focal)
+            best = _reconstruct(database_path, folder, len(images), _starts(images, refine_focal))
     if best is None:
         raise InputError(
             f"--cameras estimate: none of the {len(images)} images could be registered; give more images that overlap, "
@@ -85,20 +85,27 @@ def run_incremental_sfm(images: "Sequence[UncalibratedImage]", refine_focal: boo
     return cameras, _checked(np.concatenate([np.zeros(0), *depths]), len(cameras))
 
 
+def _starts(images: "Sequence[UncalibratedImage]", refine_focal: bool) -> Sequence[Start]:
+    """The ways to start, of which the first good one is taken."""
+    if any(image.focal is None for image in images):
+        return UNKNOWN_STARTS
+    if not refine_focal:
+        return [Start(held=True)]
+    few = len(images) <= MAX_HELD
+    return [Start(held=few), Start(held=not few)]
+
+
 def _reconstruct(
-    database_path: Path, folder: Path, images: "Sequence[UncalibratedImage]", refine_focal: bool
+    database_path: Path, folder: Path, count: int, starts: Sequence[Start]
 ) -> "pycolmap.Reconstruction | None":
-    """The reconstruction from the known focal lengths, or the best from those of STARTS, up to the first good one."""
-    if all(image.focal is not None for image in images):
-        return _map_right_relief(database_path, folder, refine_focal and len(images) > MAX_HELD)
+    """The best reconstruction of `count` images from these starts, up to the first good one."""
     best = None
-    for start in STARTS:
+    for start in starts:
         _set_unknown_focals(database_path, start.focal)
-        found = _map_right_relief(database_path, folder, refine_focal and not start.held)
-        best = max(best, found, key=_usable)
+        best = max(best, _map_right_relief(database_path, folder, not start.held), key=_usable)
         registered, points = _usable(best)
-        LOG.info("from a focal length of %.2f sides, best: %d images, %d points", start.focal, registered, points)
-        if registered > GOOD_SHARE * len(images) or registered >= GOOD_COUNT:
+        LOG.info("%s: %d images and %d points at best", start, registered, points)
+        if registered > GOOD_SHARE * count or registered >= GOOD_COUNT:
             break
     return best
 
@@ -179,7 +186,7 @@ def _write_camera(database: "pycolmap.Database", image: "UncalibratedImage") -> 
     import pycolmap
 
     width, height = image.width, image.height
-    focal = image.focal or STARTS[0].focal * max(width, height)
+    focal = image.focal or UNKNOWN_STARTS[0].focal * max(width, height)
     camera = pycolmap.Camera(model=CAMERA_MODEL, width=width, height=height, params=[focal, width / 2, height / 2, 0.0])
     camera.has_prior_focal_length = image.focal is not None
     return int(database.write_camera(camera))

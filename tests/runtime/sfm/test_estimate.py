@@ -160,8 +160,8 @@ def test_refusals(room, tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_a_start_that_is_held_is_the_focal_length_in_each_run(room, monkeypatch):
     paths, known = room
-    start = Start(1.1 * known[0].K[0, 0] / known[0].width, held=True)
-    monkeypatch.setattr(incremental, "STARTS", [start])
+    start = Start(held=True, focal=1.1 * known[0].K[0, 0] / known[0].width)
+    monkeypatch.setattr(incremental, "UNKNOWN_STARTS", [start])
     found, again = estimate_cameras(paths), estimate_cameras(paths)
     assert [camera.name for camera in found] == [str(path) for path in paths]
     assert found[0].K[0, 0] == pytest.approx(start.focal * known[0].width, rel=1e-9)
@@ -175,6 +175,15 @@ def test_the_mapper_holds_known_focal_lengths_of_few_images(room, tagged, monkey
     monkeypatch.setattr(incremental, "MAX_HELD", most)
     film = exif_focal(tagged[0], *reversed(load_image(tagged[0]).shape[:2]))
     assert (estimate_cameras(tagged)[0].K[0, 0] == pytest.approx(film, rel=1e-6)) == held
+
+
+@pytest.mark.parametrize(
+    ("images", "refine_focal", "held"),
+    [(incremental.MAX_HELD, True, [True, False]), (incremental.MAX_HELD + 1, True, [False, True]), (3, False, [True])],
+)
+def test_known_focal_lengths_are_held_and_refined(images, refine_focal, held):
+    starts = incremental._starts([SimpleNamespace(focal=500.0)] * images, refine_focal)
+    assert [start.held for start in starts] == held
 
 
 def model(registered, points, focal):
@@ -199,8 +208,8 @@ def test_the_best_reconstruction_is_kept(found, best, tried, monkeypatch):
     left = list(found)
     monkeypatch.setattr(incremental, "_set_unknown_focals", lambda *_: None)
     monkeypatch.setattr(incremental, "_map_right_relief", lambda *_: left.pop(0))
-    images = [SimpleNamespace(focal=None)] * 4
-    assert incremental._reconstruct("database", "folder", images, refine_focal=True) is found[best]
+    starts = incremental._starts([SimpleNamespace(focal=None)] * 4, refine_focal=True)
+    assert incremental._reconstruct("database", "folder", 4, starts) is found[best]
     assert len(found) - len(left) == tried
 
 
