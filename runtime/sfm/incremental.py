@@ -186,7 +186,7 @@ def _write_camera(database: "pycolmap.Database", image: "UncalibratedImage") -> 
     import pycolmap
 
     width, height = image.width, image.height
-    focal = image.focal or UNKNOWN_STARTS[0].focal * max(width, height)
+    focal = image.focal or max(width, height)  # each start sets those that are unknown
     camera = pycolmap.Camera(model=CAMERA_MODEL, width=width, height=height, params=[focal, width / 2, height / 2, 0.0])
     camera.has_prior_focal_length = image.focal is not None
     return int(database.write_camera(camera))

@@ -19,6 +19,14 @@ def git(folder: Path, *arguments: str) -> str:
     return done.stdout.strip()
 
 
+def commit_all(root: Path) -> str:
+    """Make a folder a work tree with all its files in one commit, whose hash is returned."""
+    git(root, "init", "--quiet")
+    git(root, "add", ".")
+    git(root, "commit", "--quiet", "--message", "images")
+    return git(root, "rev-parse", "HEAD")
+
+
 def list_one_capture(
     path: Path,
     scene: Path,

@@ -29,7 +29,7 @@ from idesplat.tools.evaluation.cases import PosedImages
 from idesplat.tools.evaluation.cli import main
 from idesplat.tools.evaluation.metrics import HIGHEST_PSNR, fit_exposure, psnr
 from idesplat.tools.evaluation.novel_views import render_target
-from one_capture import git, list_one_capture
+from one_capture import commit_all, git, list_one_capture
 
 FROZEN = "80acbf9275524955671281f8624c836b5390a7f5a0c16d9198441bf9f610e824"
 TRAINED_ON = {"vork/maryRose", "alicevision/dataset_buddha"}
@@ -45,12 +45,10 @@ def repository(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[P
     root = tmp_path_factory.mktemp("host") / REPOSITORY
     shutil.copytree(scene / "images", root / FOLDER)
     (root / "readme").write_text("a file beside them")
-    git(root, "init", "--quiet")
+    commit = commit_all(root)
     git(root, "config", "uploadpack.allowFilter", "true")
     git(root, "config", "uploadpack.allowAnySHA1InWant", "true")
-    git(root, "add", ".")
-    git(root, "commit", "--quiet", "--message", "images")
-    return root, git(root, "rev-parse", "HEAD")
+    return root, commit
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from conftest import run_command
 from idesplat.runtime.cameras.camera import Camera
 from idesplat.tools.evaluation.captures.estimated_cameras import MAX_ERROR, auc, main, pose_error
 from idesplat.tools.synthetic.make_scene import make_scene
-from one_capture import git, list_one_capture
+from one_capture import commit_all, list_one_capture
 
 REPOSITORY, FOLDER = "someone/photos", "images"
 
@@ -42,12 +42,9 @@ def test_a_room_is_estimated_with_and_without_its_focal_length(
     make_scene(tmp_path / "scene", seed=2, views=3, height=360, width=480)
     root = tmp_path / REPOSITORY
     shutil.copytree(tmp_path / "scene" / "images", root / FOLDER)
-    git(root, "init", "--quiet")
-    git(root, "add", ".")
-    git(root, "commit", "--quiet", "--message", "images")
     names = sorted(path.name for path in (root / FOLDER).iterdir())
     fields = {
-        **{"repository": REPOSITORY, "commit": git(root, "rev-parse", "HEAD"), "folder": FOLDER, "epipolar_px": 0.1},
+        **{"repository": REPOSITORY, "commit": commit_all(root), "folder": FOLDER, "epipolar_px": 0.1},
         **{"triples": [[names[0], names[2], names[1]]], "views": names[::2], "between": names[1:2]},
     }
     list_one_capture(tmp_path / "captures.json", tmp_path / "scene", fields, monkeypatch)

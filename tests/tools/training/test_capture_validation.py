@@ -19,7 +19,7 @@ from idesplat.tools.training.capture_validation import check_not_trained_on
 from idesplat.tools.training.options import Objective, Resources
 from idesplat.tools.training.run_files import CHECKPOINT, LOG
 from idesplat.tools.training.trainer import CAPTURES_PSNR, Trainer
-from one_capture import git, list_one_capture
+from one_capture import commit_all, git, list_one_capture
 from test_train import SETTINGS, SMALL, logged, one_thread, refused
 
 __all__ = ["one_thread"]  # a fixture
@@ -34,11 +34,8 @@ def checkouts(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> P
     folder = tmp_path / "checkouts"
     root = folder / "someone+photos"
     shutil.copytree(scene, root)
-    git(root, "init", "--quiet")
-    git(root, "add", ".")
-    git(root, "commit", "--quiet", "--message", "images")
     fields = {
-        **{"repository": "someone/photos", "commit": git(root, "rev-parse", "HEAD"), "folder": "images"},
+        **{"repository": "someone/photos", "commit": commit_all(root), "folder": "images"},
         **{"triples": [TRIPLE], "views": TRIPLE[:2], "between": TRIPLE[2:]},
     }
     list_one_capture(tmp_path / "captures.json", scene, fields, monkeypatch, NEAR_FAR)

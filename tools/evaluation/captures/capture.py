@@ -25,8 +25,9 @@ from typing import Any
 
 import numpy as np
 
-from ....runtime.cameras.camera import Camera
+from ....runtime.cameras.camera import Camera, resize_camera
 from ....runtime.cameras.parsing import entries, read_json
+from ....runtime.cameras.undistortion import shrink
 from ....runtime.errors import InputError, error_context
 from ....runtime.geometry.intrinsics import intrinsic_matrix
 from ....runtime.geometry.quaternions import quaternions_to_matrices
@@ -171,6 +172,12 @@ def load_cropped(path: Path, crop: Crop | None) -> np.ndarray:
         return image
     left, top, right, bottom = crop
     return image[top:bottom, left:right]
+
+
+def load_shrunk(capture: Capture, folder: Path, name: str, max_side: int) -> tuple[np.ndarray, Camera]:
+    """A frame in a folder, its longer side at most `max_side` pixels, and its camera; raises InputError."""
+    image = load_cropped(folder / name, capture.crop)
+    return shrink(image, resize_camera(capture.cameras[name], image.shape[1], image.shape[0]), max_side)
 
 
 def window_start(views: int, count: int) -> int:

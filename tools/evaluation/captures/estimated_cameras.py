@@ -20,8 +20,7 @@ import typer
 from PIL import Image
 from rich.table import Table
 
-from ....runtime.cameras.camera import Camera, resize_camera
-from ....runtime.cameras.undistortion import shrink
+from ....runtime.cameras.camera import Camera
 from ....runtime.cli.terminal import run
 from ....runtime.errors import InputError
 from ....runtime.geometry.rigid import invert_rigid
@@ -30,7 +29,7 @@ from ....runtime.sfm.estimate import estimate_cameras
 from ....runtime.system.files import scratch_folder
 from ....runtime.system.progress import progress
 from ..report import print_table
-from .capture import Capture, load_cropped, read_captures
+from .capture import Capture, load_shrunk, read_captures
 from .checkouts import frames_of
 
 IMAGES = (3, 4, 6, 8)  # in a row
@@ -82,10 +81,8 @@ def _write(capture: Capture, checkouts: Path, folder: Path, factor: float | None
     """Write the frames, with focal lengths times `factor` in their EXIF data unless it is None; their cameras."""
     cameras = []
     with frames_of(checkouts, capture) as source:
-        for name in sorted(capture.frames, key=lambda name: (len(name), name)):
-            image = load_cropped(source / name, capture.crop)
-            camera = resize_camera(capture.cameras[name], image.shape[1], image.shape[0])
-            image, camera = shrink(image, camera, SIDE)
+        for name in capture.frames:
+            image, camera = load_shrunk(capture, source, name, SIDE)
             exif = Image.Exif()
             if factor is not None:
                 diagonal = np.hypot(camera.width, camera.height)

@@ -18,8 +18,7 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from ....runtime.cameras.camera import Camera, resize_camera
-from ....runtime.cameras.undistortion import shrink
+from ....runtime.cameras.camera import Camera
 from ....runtime.cli.terminal import run, say
 from ....runtime.errors import InputError
 from ....runtime.images.colormaps import to_uint8
@@ -27,7 +26,7 @@ from ....runtime.views.checks import Defect, find_defects
 from ....runtime.views.loader import ViewLoader
 from ....runtime.views.selection import PairScorer, guess_scene_depths
 from ..report import print_table
-from .capture import Capture, load_cropped, read_captures
+from .capture import Capture, load_shrunk, read_captures
 from .checkouts import frames_of
 
 Posed = tuple[np.ndarray, Camera]  # image, uint8 RGB [height, width, 3], and its camera
@@ -81,12 +80,8 @@ def count_spoiled(
 
 def _load(capture: Capture, checkouts: Path) -> list[Posed]:
     """All frames of a capture, reduced, with their cameras."""
-    pairs = []
     with frames_of(checkouts, capture) as folder:
-        for name, camera in capture.cameras.items():
-            image = load_cropped(folder / name, capture.crop)
-            pairs.append(shrink(image, resize_camera(camera, image.shape[1], image.shape[0]), SIDE))
-    return pairs
+        return [load_shrunk(capture, folder, name, SIDE) for name in capture.frames]
 
 
 def _partners(cameras: Sequence[Camera]) -> np.ndarray:
