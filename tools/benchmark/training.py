@@ -7,6 +7,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -129,15 +130,14 @@ def _timed_steps(run: "Trainer", steps: int) -> dict[str, Any]:
     """Make some steps after the warm-up; CPU seconds are summed over the processes."""
     from ..training.data.samples import prefetch
 
-    scenes = prefetch(run.specs(), run.task.load)
-    for _ in range(WARM_UP):
-        run.train_step(scenes)
-    parts = _timed_parts(run)
-    started, cpu = time.perf_counter(), time.process_time()
-    for _ in range(steps):
-        run.train_step(_timed(scenes, parts))
-    seconds, cpu = time.perf_counter() - started, time.process_time() - cpu
-    scenes.close()
+    with closing(prefetch(run.specs(), run.task.load)) as scenes:
+        for _ in range(WARM_UP):
+            run.train_step(scenes)
+        parts = _timed_parts(run)
+        started, cpu = time.perf_counter(), time.process_time()
+        for _ in range(steps):
+            run.train_step(_timed(scenes, parts))
+        seconds, cpu = time.perf_counter() - started, time.process_time() - cpu
     total_cpu = sum(entry["cpu"] for entry in run.group.gather([{"cpu": cpu}]))
     parts["rendering and losses"] -= sum(parts[name] for name, _ in run.state.model.named_children())
     parts["backward"] = seconds - sum(parts.values())

@@ -8,7 +8,8 @@ import ctypes
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing
 from dataclasses import asdict
 from functools import partial
 from itertools import islice
@@ -151,22 +152,22 @@ class Trainer:
     def fit(self, save_every: float, validate_every: int, on_step: OnStep | None = None) -> None:
         """Train to the last step. save_every: seconds, from the first step on. validate_every: steps."""
         saved = -math.inf
-        samples = self.samples()
-        while self.state.step < self.settings.steps:
-            entry = self.train_step(samples)
-            if self.log is None:
-                continue
-            validated = self.state.step % validate_every == 0 or self.state.step == self.settings.steps
-            if validated:
-                entry |= self.validate()
-            self.log.add(entry)
-            if validated:
-                write_curves(self.folder / CURVES, self.log.entries, PLOTTED)
-            if on_step is not None:
-                on_step(entry)
-            if time.monotonic() - saved >= save_every:
-                self.save()
-                saved = time.monotonic()
+        with closing(self.samples()) as samples:
+            while self.state.step < self.settings.steps:
+                entry = self.train_step(samples)
+                if self.log is None:
+                    continue
+                validated = self.state.step % validate_every == 0 or self.state.step == self.settings.steps
+                if validated:
+                    entry |= self.validate()
+                self.log.add(entry)
+                if validated:
+                    write_curves(self.folder / CURVES, self.log.entries, PLOTTED)
+                if on_step is not None:
+                    on_step(entry)
+                if time.monotonic() - saved >= save_every:
+                    self.save()
+                    saved = time.monotonic()
         if self.group.is_main:
             self.save()
 
@@ -180,8 +181,8 @@ class Trainer:
             for slot in self.group.shard(self.settings.batch):
                 yield self.task.spec(step, slot, self.phase(step))
 
-    def samples(self) -> Iterator[Any]:
-        """This process's samples of all steps that are left, loaded ahead of their use."""
+    def samples(self) -> Generator[Any]:
+        """This process's samples of all steps that are left, loaded ahead of their use. To be closed."""
         if self.loaders:
             return prefetch_in_processes(list(self.specs()), self.source, self.loaders)
         return prefetch(self.specs(), self.task.load)

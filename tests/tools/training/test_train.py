@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, replace
@@ -298,6 +299,21 @@ def test_run_stopped_before_the_next_checkpoint_repeats_its_command(tmp_path: Pa
         Trainer(tmp_path, SETTINGS, SMALL).fit(save_every=1e9, validate_every=4, on_step=stop)
     resumed = Trainer(tmp_path, SETTINGS, SMALL)
     assert resumed.state.step == 1 and len(logged(tmp_path)) == 1
+
+
+def test_a_stopped_run_leaves_no_thread(tmp_path: Path) -> None:
+    """Also while the exception, which refers to the run's frames, is kept."""
+
+    def stop(entry: dict[str, float]) -> None:
+        assert loaders()
+        raise KeyboardInterrupt
+
+    def loaders() -> list[str]:
+        return [thread.name for thread in threading.enumerate() if thread.name.startswith("samples")]
+
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        Trainer(tmp_path, SETTINGS, SMALL).fit(save_every=1e9, validate_every=4, on_step=stop)
+    assert not loaders(), stopped
 
 
 @pytest.mark.parametrize("quiet", (False, True))

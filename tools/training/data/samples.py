@@ -77,7 +77,11 @@ def stack_scenes(scenes: Sequence[TrainingViews]) -> TrainingViews:
 
 
 def prefetch(specs: Iterator[SampleSpec], load: Callable[[SampleSpec], T]) -> Generator[T]:
-    """The samples of `specs`, in that order, loaded by a background thread."""
+    """The samples of `specs`, in that order, loaded by a background thread.
+
+    Close the generator where it is not exhausted. Left to the garbage collector, it ends its thread in whichever thread
+    collects it, which waits for itself if it is just starting or ending.
+    """
     with ThreadPoolExecutor(1, thread_name_prefix="samples") as pool:
         pending: deque[Future[T]] = deque()
         try:
@@ -94,8 +98,8 @@ def prefetch(specs: Iterator[SampleSpec], load: Callable[[SampleSpec], T]) -> Ge
 
 def prefetch_in_processes(
     specs: Sequence[SampleSpec], load: Callable[[SampleSpec], TrainingViews], processes: int
-) -> Iterator[TrainingViews]:
-    """The samples of `specs`, in that order, loaded by `processes` processes.
+) -> Generator[TrainingViews]:
+    """The samples of `specs`, in that order, loaded by `processes` processes, which end when it is closed.
 
     load: can be pickled. An InputError of it is raised here.
     """
@@ -111,7 +115,7 @@ def prefetch_in_processes(
         return _without_errors(iter(loader))
 
 
-def _without_errors(samples: Iterator[TrainingViews | InputError]) -> Iterator[TrainingViews]:
+def _without_errors(samples: Iterator[TrainingViews | InputError]) -> Generator[TrainingViews]:
     """The samples; raises the first error among them."""
     for sample in samples:
         if isinstance(sample, InputError):
