@@ -18,12 +18,14 @@ from ..system.threads import map_in_threads
 from ..views.batch import ViewBatch
 from .agreement import SQUARE, Agreement
 
-MIN_VIEWS = 4  # fewer cannot outvote a wrong match
+MIN_VIEWS = 3  # the network saw both of two at once
 SOURCES = 4  # neighbours whose images and surfaces are compared
 STEPS = (0.99, 1.01)  # candidates, times the depth; the network's median error is 0.8 %
 WINDOW = 5  # pixels a side of a patch, and of the pixels that choose together
 NOISE = 1e-3  # variance of a patch, of colours in [0, 1], at which ZNCC counts half: plain surfaces match everywhere
-OWN_MARGIN = 0.1  # by which a candidate must be better than the depth as predicted
+# By which a candidate must be better than the depth as predicted. With three views, few votes speak against a wrong
+# match.
+OWN_MARGIN, OWN_MARGIN_OF_THREE = 0.1, 0.2
 OUTSIDE = np.nan  # ZNCC of a patch that a view does not see
 
 
@@ -33,8 +35,10 @@ def correct_depths(prediction: Prediction, views: ViewBatch, voters: list[np.nda
     voters: for each view, the others that are asked, nearest first, as arrays of indices. Fewer than MIN_VIEWS views
     stay as they are.
     """
-    if len(views.names) < MIN_VIEWS:
+    count = len(views.names)
+    if count < MIN_VIEWS:
         return prediction
+    margin = OWN_MARGIN_OF_THREE if count == 3 else OWN_MARGIN
     agreement = Agreement(prediction.depth, views, voters)
     matcher = Matcher(views.images, agreement.surfaces)
 
@@ -44,13 +48,13 @@ def correct_depths(prediction: Prediction, views: ViewBatch, voters: list[np.nda
 
     def correct(view: int) -> np.ndarray:
         depth = agreement.surfaces.depth[view]
-        best = rate(view, depth) + OWN_MARGIN
+        best = rate(view, depth) + margin
         for candidate in _candidates(agreement, view, voters[view][:SOURCES]):
             score = rate(view, candidate)
             depth, best = np.where(score > best, candidate, depth), np.maximum(score, best)
         return depth
 
-    return _at_depth(prediction, np.stack(map_in_threads(correct, len(views.names))), views.extrinsics)
+    return _at_depth(prediction, np.stack(map_in_threads(correct, count)), views.extrinsics)
 
 
 class Matcher:
