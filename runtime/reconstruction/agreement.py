@@ -1,17 +1,9 @@
-"""The choice among several predictions of a view: at each pixel, the depth that most other views agree with.
-
-Groups of views overlap, so that the network predicts most views several times, each time beside other partners. Which
-partners suit a pixel best is not known before: the depth of the views that are asked tells it, as a majority.
-"""
-
-from collections.abc import Sequence
+"""How many views agree with a depth: those whose surface is there, in a colour that fits."""
 
 import cv2
 import numpy as np
 
 from ..geometry.consistency import DEPTH_TOLERANCE
-from ..inference.predictor import Prediction
-from ..splats.gaussians import Gaussians
 from ..splats.points import unproject
 from ..splats.surfaces import Surfaces, color_agrees, project_to_pixel
 from ..system.compilation import compiled
@@ -19,8 +11,6 @@ from ..views.batch import ViewBatch
 
 # Votes that every depth has beside those of the views, half of one for it: few votes decide less than many.
 PRIOR_VOTES, PRIOR_SUPPORT = 2.0, 0.5
-OWN_MARGIN = 0.1  # by which another group's depth must be better than that of the view's own group
-WINDOW = 5  # pixels a side that choose together: neighbours are mostly of one surface
 SQUARE = np.ones((3, 3), np.uint8)  # points project between pixels, so their neighbours count as well
 
 
@@ -39,18 +29,6 @@ class Agreement:
         self.nearest = np.stack([cv2.erode(surface, SQUARE) for surface in self.surfaces.depth])
         self.farthest = np.stack([cv2.dilate(surface, SQUARE) for surface in self.surfaces.depth])
 
-    def best(self, view: int, predictions: Sequence[Prediction]) -> Prediction:
-        """The pixels of several predictions of a view that most of its neighbours agree with, as one prediction.
-
-        predictions: that of the view's own group first, which is kept where no other is better by OWN_MARGIN.
-        """
-        if len(predictions) == 1:
-            return predictions[0]
-        scores = [self.score(view, prediction.depth[0]) for prediction in predictions]
-        means = np.stack([cv2.blur(score, (WINDOW, WINDOW)) for score in scores])
-        means[0] += OWN_MARGIN
-        return _merge(predictions, means.argmax(axis=0))
-
     def score(self, view: int, depth: np.ndarray) -> np.ndarray:
         """The share of the votes for each pixel's depth, float32 [height, width]."""
         s = self.surfaces
@@ -64,15 +42,6 @@ class Agreement:
         """The points of a view's depth map [height, width], float32 [height, width, 3]: one view's, to save memory."""
         one = slice(view, view + 1)
         return unproject(depth[None], self.views.extrinsics[one], self.views.intrinsics[one])[0].astype(np.float32)
-
-
-def _merge(predictions: Sequence[Prediction], chosen: np.ndarray) -> Prediction:
-    """One prediction of a view from several, chosen [height, width] at each pixel by index."""
-    pixels = np.arange(chosen.size)
-    depth = np.stack([prediction.depth.ravel() for prediction in predictions])[chosen.ravel(), pixels]
-    sets = [prediction.gaussians for prediction in predictions if prediction.gaussians is not None]
-    gaussians = Gaussians.concatenate(sets).select(chosen.ravel() * chosen.size + pixels) if sets else None
-    return Prediction(depth.reshape(predictions[0].depth.shape), gaussians, {}, predictions[0].cameras)
 
 
 @compiled()

@@ -14,8 +14,8 @@ from ..system.threads import map_in_threads
 from ..views.batch import ViewBatch
 from ..views.depth_range import BASELINE, DepthRange
 from ..views.groups import ViewGroup, group_views, nearest_views
-from .agreement import Agreement
 from .enlarging import network_size, predict_enlarged
+from .rating import DepthRating
 
 # Pixels of all views that the network gets together: about 2 GB of memory with the bundled model.
 GROUP_PIXELS = 600_000
@@ -38,7 +38,7 @@ def predict_views(
 ) -> Prediction:
     """Depth and Gaussians of all views, each predicted beside the views that suit it best.
 
-    Where groups overlap, a view is predicted several times: of these, each pixel is the one that most views agree with.
+    Where groups overlap, a view is predicted several times: each pixel is the one that suits the other views best.
     span: the depth range of all views. near, far: where they are given; else each group has its own depth range, which
     starts where its surfaces do, so that more depth candidates lie there. for_fusion: whether the result is fused, so
     that more time may be spent: images that are too large for the network are given to it smaller (`enlarging`), and
@@ -92,11 +92,11 @@ def _predict_groups(
 
 def _choose(parts: list[list[Prediction]], views: ViewBatch, span: DepthRange) -> list[Prediction]:
     """One prediction of each view; `parts` is emptied, so that no more than needed stays in memory."""
-    agreement = Agreement(np.concatenate([own.depth for own, *_ in parts]), views, voting_views(views, span))
+    rating = DepthRating(np.concatenate([own.depth for own, *_ in parts]), views, voting_views(views, span))
 
     def choose(view: int) -> Prediction:
         predictions, parts[view] = parts[view], []
-        return agreement.best(view, predictions)
+        return rating.best(view, predictions)
 
     return map_in_threads(choose, len(parts))
 

@@ -160,13 +160,13 @@ def test_no_more_predictions_are_kept_than_fit_the_memory(
     views = batch(9)
     views.images[:] = 0.5
     chosen_from: list[int] = []
-    best = many_views.Agreement.best
+    best = many_views.DepthRating.best
 
-    def counting_best(agreement: many_views.Agreement, view: int, predictions: list[Prediction]) -> Prediction:
+    def counting_best(rating: many_views.DepthRating, view: int, predictions: list[Prediction]) -> Prediction:
         chosen_from.append(len(predictions))
-        return best(agreement, view, predictions)
+        return best(rating, view, predictions)
 
-    monkeypatch.setattr(many_views.Agreement, "best", counting_best)
+    monkeypatch.setattr(many_views.DepthRating, "best", counting_best)
     monkeypatch.setattr(many_views, "OTHER_PIXELS", other_views * HEIGHT * WIDTH)
     prediction = many_views.predict_views(NumberingPredictor(True, trained_views=3), views, SPAN)
     np.testing.assert_array_equal(prediction.depth, 0.5)

@@ -1,4 +1,4 @@
-"""Depth corrected by stereo matching, on textured and plain planes that cameras beside each other see."""
+"""Depth corrected, and chosen, by stereo matching, on textured and plain planes that cameras beside each other see."""
 
 from dataclasses import replace
 
@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from idesplat.runtime.inference.predictor import Prediction
+from idesplat.runtime.reconstruction.rating import DepthRating
 from idesplat.runtime.reconstruction.stereo import MIN_VIEWS, correct_depths
 from idesplat.runtime.views.batch import ViewBatch
 from views_in_a_row import prediction_of, views_in_a_row
@@ -26,12 +27,12 @@ def plane_views(count: int = VIEWS, textured: bool = True) -> ViewBatch:
 
 
 def corrected(depth: np.ndarray, views: ViewBatch) -> Prediction:
-    """All views are asked about each."""
-    count = len(views.names)
-    voters = [
-        np.array(sorted(set(range(count)) - {view}, key=lambda other: abs(other - view))) for view in range(count)
-    ]
-    return correct_depths(prediction_of(depth, views), views, voters)
+    return correct_depths(prediction_of(depth, views), views, all_voters(len(views.names)))
+
+
+def all_voters(count: int) -> list[np.ndarray]:
+    """All views are asked about each, the nearest first."""
+    return [np.array(sorted(set(range(count)) - {view}, key=lambda other: abs(other - view))) for view in range(count)]
 
 
 def plane_depth(count: int = VIEWS) -> np.ndarray:
@@ -85,3 +86,13 @@ def test_views_that_see_nothing_of_the_same_stay_as_predicted() -> None:
     depth = plane_depth()
     depth[2] *= 1.01
     np.testing.assert_array_equal(corrected(depth, replace(views, extrinsics=apart)).depth, depth)
+
+
+def test_of_depths_that_all_views_agree_with_the_images_choose() -> None:
+    """The surfaces of the other views agree with both within their tolerance."""
+    views = plane_views()
+    contrasty = replace(views, images=0.5 + 4 * (views.images - 0.5))
+    rating = DepthRating(plane_depth(), contrasty, all_voters(VIEWS))
+    right, near = (Prediction(factor * plane_depth(1), None) for factor in (1, 0.96))
+    for predictions in ([right, near], [near, right]):
+        assert (rating.best(2, predictions).depth[0][INNER] == PLANE).mean() > 0.99

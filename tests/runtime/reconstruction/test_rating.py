@@ -1,8 +1,11 @@
 """The choice among several predictions of a view, on a plane that five cameras see."""
 
+from dataclasses import replace
+
 import numpy as np
 from idesplat.runtime.inference.predictor import Prediction
-from idesplat.runtime.reconstruction.agreement import WINDOW, Agreement
+from idesplat.runtime.reconstruction.patches import WINDOW
+from idesplat.runtime.reconstruction.rating import DepthRating
 from idesplat.runtime.splats.gaussians import Gaussians
 from idesplat.runtime.views.batch import ViewBatch
 from views_in_a_row import views_in_a_row
@@ -20,11 +23,10 @@ def plane_views(colors: np.ndarray | None = None) -> ViewBatch:
     return views_in_a_row(images, 0.3 * np.arange(VIEWS), K)
 
 
-def agreement(views: ViewBatch, neighbors: list[list[int]] | None = None) -> Agreement:
-    """All views see the plane; each is asked about the others unless neighbors are given."""
-    others = neighbors or [[other for other in range(VIEWS) if other != view] for view in range(VIEWS)]
+def rating(views: ViewBatch) -> DepthRating:
+    """All views have the plane as their surface, and each is asked about the others."""
     depth = np.full((VIEWS, HEIGHT, WIDTH), PLANE, np.float32)
-    return Agreement(depth, views, [np.array(each, np.int64) for each in others])
+    return DepthRating(depth, views, [np.delete(np.arange(VIEWS), view) for view in range(VIEWS)])
 
 
 def predicted(depth: np.ndarray, gaussians: bool = True) -> Prediction:
@@ -48,8 +50,9 @@ def halves(left: float, right: float) -> np.ndarray:
 
 
 def test_each_pixel_is_of_the_prediction_that_the_other_views_agree_with() -> None:
-    choice = agreement(plane_views())
-    best = choice.best(2, [predicted(halves(PLANE, WRONG)), predicted(halves(WRONG, PLANE)), predicted(halves(4, 5))])
+    best = rating(plane_views()).best(
+        2, [predicted(halves(PLANE, WRONG)), predicted(halves(WRONG, PLANE)), predicted(halves(4, 5))]
+    )
     edge = WIDTH // 2
     inner = np.abs(np.arange(WIDTH) - edge) > WINDOW
     assert best.depth.shape == (1, HEIGHT, WIDTH)
@@ -59,13 +62,16 @@ def test_each_pixel_is_of_the_prediction_that_the_other_views_agree_with() -> No
 
 def test_equal_predictions_leave_that_of_the_own_group() -> None:
     own, other = predicted(halves(PLANE, PLANE)), predicted(halves(PLANE + 0.1, PLANE + 0.1))
-    best = agreement(plane_views()).best(0, [own, other])
+    best = rating(plane_views()).best(0, [own, other])
     np.testing.assert_array_equal(best.depth, own.depth)
 
 
-def test_without_views_that_vote_the_own_group_decides() -> None:
+def test_without_views_that_see_the_same_the_own_group_decides() -> None:
     own, other = predicted(halves(WRONG, WRONG)), predicted(halves(PLANE, PLANE))
-    best = agreement(plane_views(), [[] for _ in range(VIEWS)]).best(0, [own, other])
+    views = plane_views()
+    apart = views.extrinsics.copy()
+    apart[:, 0, 3] *= 1000
+    best = rating(replace(views, extrinsics=apart)).best(0, [own, other])
     np.testing.assert_array_equal(best.depth, own.depth)
 
 
@@ -73,20 +79,20 @@ def test_agreement_in_depth_does_not_count_where_colours_differ() -> None:
     colors = np.full((VIEWS, 3), 0.1, np.float32)
     colors[2] = 0.9
     own, other = predicted(halves(WRONG, WRONG)), predicted(halves(PLANE, PLANE))
-    np.testing.assert_array_equal(agreement(plane_views(colors)).best(2, [own, other]).depth, own.depth)
-    np.testing.assert_array_equal(agreement(plane_views()).best(2, [own, other]).depth, other.depth)
+    np.testing.assert_array_equal(rating(plane_views(colors)).best(2, [own, other]).depth, own.depth)
+    np.testing.assert_array_equal(rating(plane_views()).best(2, [own, other]).depth, other.depth)
 
 
 def test_what_the_others_do_not_see_is_no_better_than_the_own_depth() -> None:
     """A depth behind the others' surfaces has no votes, one that half of the voters agree with has more support."""
     hidden = predicted(halves(2 * PLANE, 2 * PLANE))
     right = predicted(halves(PLANE, PLANE))
-    np.testing.assert_array_equal(agreement(plane_views()).best(2, [right, hidden]).depth, right.depth)
-    np.testing.assert_array_equal(agreement(plane_views()).best(2, [hidden, right]).depth, right.depth)
+    np.testing.assert_array_equal(rating(plane_views()).best(2, [right, hidden]).depth, right.depth)
+    np.testing.assert_array_equal(rating(plane_views()).best(2, [hidden, right]).depth, right.depth)
 
 
 def test_models_of_depth_alone_have_a_choice_too() -> None:
     own, other = predicted(halves(WRONG, WRONG), gaussians=False), predicted(halves(PLANE, PLANE), gaussians=False)
-    best = agreement(plane_views()).best(1, [own, other])
+    best = rating(plane_views()).best(1, [own, other])
     np.testing.assert_array_equal(best.depth, other.depth)
     assert best.gaussians is None
