@@ -1,7 +1,7 @@
 """Depth maps corrected by stereo matching, once all views are there: the network sees two or three at a time.
 
 A pixel has few candidates: its depth, a little less and more, and the depths of the neighbours' surfaces there. It
-takes the one that suits the other views best (`DepthRating`).
+takes the one that suits the other views best (`DepthRating`), unless that would leave a speckle.
 """
 
 from collections.abc import Iterator
@@ -17,6 +17,7 @@ from ..system.threads import map_in_threads
 from ..views.batch import ViewBatch
 from .agreement import SQUARE
 from .rating import DepthRating
+from .speckles import find_speckles
 
 MIN_VIEWS = 3  # the network saw both of two at once
 STEPS = (0.99, 1.01)  # candidates, times the depth; the network's median error is 0.8 %
@@ -38,12 +39,12 @@ def correct_depths(prediction: Prediction, views: ViewBatch, voters: list[np.nda
     rating = DepthRating(prediction.depth, views, voters)
 
     def correct(view: int) -> np.ndarray:
-        depth = rating.surfaces.depth[view]
-        best = rating.rate(view, depth) + margin
+        own = depth = rating.surfaces.depth[view]
+        best = rating.rate(view, own) + margin
         for candidate in _candidates(rating, view):
             rated = rating.rate(view, candidate)
             depth, best = np.where(rated > best, candidate, depth), np.maximum(rated, best)
-        return depth
+        return np.where(find_speckles(depth), own, depth)
 
     return _at_depth(prediction, np.stack(map_in_threads(correct, count)), views.extrinsics)
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from idesplat.runtime.inference.predictor import Prediction
 from idesplat.runtime.reconstruction.rating import DepthRating
+from idesplat.runtime.reconstruction.speckles import find_speckles
 from idesplat.runtime.reconstruction.stereo import MIN_VIEWS, correct_depths
 from idesplat.runtime.views.batch import ViewBatch
 from views_in_a_row import prediction_of, views_in_a_row
@@ -86,6 +87,18 @@ def test_views_that_see_nothing_of_the_same_stay_as_predicted() -> None:
     depth = plane_depth()
     depth[2] *= 1.01
     np.testing.assert_array_equal(corrected(depth, replace(views, extrinsics=apart)).depth, depth)
+
+
+def test_images_without_any_match_leave_no_speckles() -> None:
+    """Of noise some patches match by chance at the depth of another view's surface."""
+    views = plane_views()
+    noise = np.random.default_rng(1).random(views.images.shape).astype(np.float32)
+    depth = plane_depth() * np.float32([0.8, 0.9, 1, 1.1, 1.2])[:, None, None]
+    done = corrected(depth, replace(views, images=noise))
+    moved = np.abs(done.depth - depth) > 1e-5
+    assert moved.any()
+    speckles = np.stack([find_speckles(view) for view in done.depth])
+    assert not (moved & speckles).any()
 
 
 def test_of_depths_that_all_views_agree_with_the_images_choose() -> None:
