@@ -53,14 +53,19 @@ def _row(capture: Capture, folder: Path) -> list[np.ndarray]:
         for quality in (Quality.FAST, Quality.STANDARD)
     )
     assert before is not None and after is not None, "the bundled model predicts Gaussians"
-    target = _small(capture.cameras[held_out[len(held_out) // 2]])
-    side = _small(orbit_cameras(after, cameras, DEGREES, 4)[1])
-    return [_render(gaussians, camera) for camera in (target, side) for gaussians in (before, after)]
+    target = capture.cameras[held_out[len(held_out) // 2]]
+    side = orbit_cameras(after, cameras, DEGREES, 4)[1]
+    return [_render(gaussians, camera) for camera in small_cameras(target, side) for gaussians in (before, after)]
 
 
-def _small(camera: Camera) -> Camera:
-    factor = SIDE / max(camera.width, camera.height)
-    return resize_camera(camera, round(camera.width * factor), round(camera.height * factor))
+def small_cameras(first: Camera, *others: Camera) -> list[Camera]:
+    """The cameras with images of the shape of the first's, SIDE pixels on the longer side.
+
+    Photographs that were undistorted one by one differ by some pixels.
+    """
+    factor = SIDE / max(first.width, first.height)
+    size = round(first.width * factor), round(first.height * factor)
+    return [resize_camera(camera, *size) for camera in (first, *others)]
 
 
 def _render(gaussians: Gaussians, camera: Camera) -> np.ndarray:
