@@ -351,6 +351,19 @@ def _adam_direction(gradient: np.ndarray, moments: np.ndarray, beta_1: float, be
 
 
 @compiled_fast
+def _center_sh_gradient(basis: np.ndarray, mean_basis: np.ndarray, gradient: np.ndarray) -> None:
+    """Make the gradient of SH of degree 1 that about the mean direction, or 0 if that is 0.
+
+    basis: at the direction, [coefficients]. mean_basis: at the mean direction, up to degree 1.
+    """
+    some = len(mean_basis) > 1 and (mean_basis[1] != 0.0 or mean_basis[2] != 0.0 or mean_basis[3] != 0.0)
+    for coefficient in range(1, len(mean_basis)):
+        aside = (basis[coefficient] - mean_basis[coefficient]) / basis[0] if some else 0.0
+        for channel in range(3):
+            gradient[11 + 3 * coefficient + channel] = aside * gradient[11 + channel]
+
+
+@compiled_fast
 def adam_step(
     means: np.ndarray,
     quats: np.ndarray,
@@ -374,14 +387,19 @@ def adam_step(
     correction: float,  # one over the bias correction of the second moments
     opacity_decay: float,
     scale_growth: float,
+    directions: np.ndarray,  # [gaussians, 3]: the mean direction to each, or 0
 ) -> None:
     """One step of Adam on the Gaussians that this view sees (selective Adam); no gradient is stored.
+
+    With d the direction and m its mean, a colour is, up to SH of degree 1, a + b (d - m). Adam optimises a and b, and
+    so the SH of degree 0 change with b, too. Else b would take part in what is the same from everywhere, and hardly
+    follow the direction where directions spread little. Where m is 0, b stays as it is.
 
     opacity_decay: times the gradient of the opacity, is subtracted from its logit. scale_growth: is added to the log
     scales. Both are outside of Adam, as in AdamW (Loshchilov and Hutter 2019).
     """
     camera, work, given = np.empty(3), np.empty((6, 3, 3)), np.empty(ENTRY)
-    basis = np.empty((2, sh.shape[1]))
+    basis, mean_basis = np.empty((2, sh.shape[1])), np.empty(min(sh.shape[1], 4))
     gradient = np.empty(11 + 3 * sh.shape[1], np.float32)
     for axis in range(3):
         camera[axis] = -np.sum(viewmat[:3, axis] * viewmat[:3, 3])
@@ -395,6 +413,8 @@ def adam_step(
             means[index], quats[index], log_scales[index], sh[index], projected[index], given,
             viewmat, K, width, height, camera, work, basis, gradient,
         )  # fmt: skip
+        fill_sh_basis(directions[index, 0], directions[index, 1], directions[index, 2], mean_basis)
+        _center_sh_gradient(basis[0], mean_basis, gradient)
         _adam_direction(gradient, moments[index], beta_1, beta_2, correction)
         for axis in range(3):
             means[index, axis] -= lr[axis] * gradient[axis]
@@ -406,4 +426,7 @@ def adam_step(
         for coefficient in range(sh.shape[1]):
             for channel in range(3):
                 column = 11 + 3 * coefficient + channel
-                sh[index, coefficient, channel] -= lr[column] * gradient[column]
+                change = lr[column] * gradient[column]
+                sh[index, coefficient, channel] -= change
+                if 0 < coefficient < len(mean_basis):
+                    sh[index, 0, channel] += change * mean_basis[coefficient] / mean_basis[0]

@@ -31,7 +31,8 @@ class RefinementOptions:
     no gradient, and lower ones leave gaps between splats.
     opacity_decay, scale_growth: subtracted from the opacity logits, times the gradient of the opacity, and added to the
     log scales, of the Gaussians that a step's view sees; both decay with the learning rates.
-    ssim_weight: of 1 - SSIM against L1. lr_*: learning rates of Adam; of the means, relative to the median depth.
+    ssim_weight: of 1 - SSIM against L1. lr_*: learning rates of Adam; of the means, relative to the median depth; of SH
+    of degree 1, to (1 - 2 / views) over the spread of the views' directions; lr_sh is of degrees 2 and 3.
     lr_poses: of the views' poses, in radians, and relative to the median depth; 0 leaves them as given.
     final_lr: what is left of the learning rates at the end, as they decay exponentially.
     """
@@ -51,6 +52,7 @@ class RefinementOptions:
     lr_quats: float = 1.2e-2
     lr_opacities: float = 0.3
     lr_dc: float = 1e-2
+    lr_sh_1: float = 4.5e-3
     lr_sh: float = 6e-3
     lr_exposure: float = 1e-3
     lr_poses: float = 0.0

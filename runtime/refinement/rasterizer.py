@@ -108,7 +108,7 @@ def compile_all() -> None:
         moments, lr = np.zeros((1, 2, parameters.columns), np.float32), np.zeros(parameters.columns)
         gradients = rasterizer.backward(done, np.zeros_like(done.rgb))
         rasterizer.weights(done, gradients)
-        rasterizer.step(done, gradients, moments, lr, 1)
+        rasterizer.step(done, gradients, moments, lr, 1, np.zeros((1, 3), np.float32))
 
 
 @dataclass(eq=False)
@@ -240,6 +240,7 @@ class GradientRasterizer:
         moments: np.ndarray,
         lr: np.ndarray,
         count: int,
+        directions: np.ndarray,
         opacity_decay: float = 0.0,
         scale_growth: float = 0.0,
     ) -> None:
@@ -251,7 +252,7 @@ class GradientRasterizer:
             kernels.adam_step(
                 p.means, p.quats, p.log_scales, p.logits, p.sh, target.viewmat, target.K, target.width, target.height,
                 start, stop, done.projected, done.boxes, done.offsets, gradients, moments, rates,
-                BETA_1, BETA_2, correction, opacity_decay, scale_growth,
+                BETA_1, BETA_2, correction, opacity_decay, scale_growth, directions,
             )  # fmt: skip
 
         self._over_gaussians(adam_step)

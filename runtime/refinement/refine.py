@@ -12,6 +12,7 @@ import numpy as np
 from ..splats.gaussians import Gaussians
 from ..system.progress import progress
 from .contributions import Contributions, strongest
+from .directions import view_directions
 from .losses import photometric_loss
 from .options import RefinementOptions
 from .poses import move_world
@@ -118,7 +119,10 @@ class Optimiser:
         self.parameters = _parameters(gaussians, views, options)
         self.rasterizer = GradientRasterizer(self.parameters)
         self.depth = _median_depth(self.parameters, views)
-        self.lr = _learning_rates(self.parameters, self.depth, options)
+        directions = view_directions(self.parameters.means, views)
+        self.directions = directions.means
+        slope = max(1 - 2 / len(views), 0) / directions.spread  # colours of two views are on a line, whatever they are
+        self.lr = _learning_rates(self.parameters, self.depth, slope, options)
         self.moments = np.zeros((len(self.parameters), 2, self.parameters.columns), np.float32)
         self.views = list(views)
         self.gains, self.offsets = np.ones((len(views), 3)), np.zeros((len(views), 3))
@@ -141,7 +145,7 @@ class Optimiser:
         if self.options.lr_poses:
             self._step_pose(index, self.rasterizer.pose_gradient(done, gradients), lr)
         decay, growth = self.options.opacity_decay * lr, self.options.scale_growth * lr
-        self.rasterizer.step(done, gradients, self.moments, self.lr * lr, self.steps, decay, growth)
+        self.rasterizer.step(done, gradients, self.moments, self.lr * lr, self.steps, self.directions, decay, growth)
         self._step_exposure(index, loss.gradient, done.rgb, lr)
         return _psnr(rendered, view)
 
@@ -160,7 +164,7 @@ class Optimiser:
         chosen = strongest(np.where(self._faint(), 0, total), limit or len(total))
         if len(chosen) < len(total):
             self.parameters = self.parameters.select(chosen)
-            self.moments = self.moments[chosen]
+            self.moments, self.directions = self.moments[chosen], self.directions[chosen]
             self.contributions.keep(chosen)
             self.rasterizer = GradientRasterizer(self.parameters)
 
@@ -240,10 +244,10 @@ def _depths(means: np.ndarray, view: PosedImage) -> np.ndarray:
     return means @ view.viewmat[2, :3].astype(np.float32) + np.float32(view.viewmat[2, 3])
 
 
-def _learning_rates(parameters: Parameters, depth: float, options: RefinementOptions) -> np.ndarray:
+def _learning_rates(parameters: Parameters, depth: float, slope: float, options: RefinementOptions) -> np.ndarray:
     lr = np.empty(parameters.columns)
     lr[:3], lr[3:7], lr[7:10] = options.lr_means * depth, options.lr_quats, options.lr_scales
-    lr[10], lr[11:14], lr[14:] = options.lr_opacities, options.lr_dc, options.lr_sh
+    lr[10], lr[11:14], lr[14:23], lr[23:] = options.lr_opacities, options.lr_dc, options.lr_sh_1 * slope, options.lr_sh
     return lr
 
 

@@ -4,6 +4,8 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from idesplat.runtime.geometry.sh import SH_0, sh_basis
+from idesplat.runtime.refinement.directions import view_directions
 from idesplat.runtime.refinement.options import prediction_options
 from idesplat.runtime.refinement.rasterizer import GradientRasterizer, Parameters
 from idesplat.runtime.refinement.refine import Optimiser, PosedImage, RefinementOptions, refine
@@ -250,3 +252,32 @@ def test_a_backdrop_keeps_its_opacity_where_others_start_with_less(views: list[P
     large = refined.scales[:, 0] > 1
     assert refined.opacities[large] == pytest.approx(0.95, abs=1e-3)
     assert refined.opacities[~large] == pytest.approx(0.2, abs=1e-3)
+
+
+def with_degree_1(gaussians: Gaussians) -> Gaussians:
+    """The same Gaussians with SH of degree 1, of the same colour from everywhere."""
+    return replace(gaussians, sh=np.pad(gaussians.sh, ((0, 0), (0, 3), (0, 0))))
+
+
+def test_colours_that_follow_the_direction_turn_about_its_mean(
+    views: list[PosedImage], wrong_colours: Gaussians
+) -> None:
+    """Where SH of degree 1 alone has a learning rate, a colour stays the same in the mean direction."""
+    before = with_degree_1(wrong_colours)
+    rates = {field.name: 0.0 for field in fields(RefinementOptions) if field.name.startswith("lr_")}
+    after = refine(before, views, RefinementOptions(steps=9, **{**rates, "lr_sh_1": 4.5e-3})).gaussians
+    directions = view_directions(before.means, views).means
+    some = directions.any(axis=1)
+    basis = sh_basis(directions[some], 4)[:, :, None]
+    assert len(after) == len(before)
+    assert np.abs(after.sh[some, 1:]).max() > 0.1
+    np.testing.assert_allclose((basis * after.sh[some]).sum(axis=1), SH_0 * before.sh[some, 0], atol=1e-5)
+    np.testing.assert_array_equal(after.sh[~some, 1:], 0)
+
+
+def test_two_views_tell_nothing_of_colours_that_follow_the_direction(
+    views: list[PosedImage], wrong_colours: Gaussians
+) -> None:
+    after = refine(with_degree_1(wrong_colours), views[:2], RefinementOptions(steps=6)).gaussians
+    assert after.sh[:, 0].std() > 0
+    np.testing.assert_array_equal(after.sh[:, 1:], 0)
