@@ -47,7 +47,7 @@ def fit_colors(gaussians: Gaussians, views: Sequence[PosedImage]) -> Gaussians:
     parameters = as_parameters(gaussians, gaussians.opacities, gaussians.scales)
     rasterizer = GradientRasterizer(parameters)
     unknowns = min(LINEAR, gaussians.sh.shape[1])
-    spread = view_directions(parameters.means, views).spread
+    spread = view_directions(parameters.means, [view.target for view in views]).spread
     stiffness = min(STIFFNESS, SPREAD_STIFFNESS * spread**2 / len(views))
     for turn in range(1, ROUNDS + 1):
         normal, right = _equations(rasterizer, views, unknowns, f"fitting colours, {turn} of {ROUNDS}")

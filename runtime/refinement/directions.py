@@ -6,7 +6,6 @@ a texture, however near to each other the cameras are. So it takes steeper colou
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,9 +13,7 @@ from ..geometry.rigid import invert_rigid
 from ..splats.surfaces import project_to_pixel
 from ..system.compilation import compiled
 from ..system.threads import map_in_threads
-
-if TYPE_CHECKING:
-    from .refine import PosedImage
+from .rasterizer import Target
 
 LEAST_SPREAD = 0.02  # a degree
 BLOCK = 1 << 14  # Gaussians of one task
@@ -35,13 +32,11 @@ class ViewDirections:
     spread: float
 
 
-def view_directions(means: np.ndarray, views: Sequence["PosedImage"]) -> ViewDirections:
+def view_directions(means: np.ndarray, views: Sequence[Target]) -> ViewDirections:
     """The directions of views to Gaussians with these means, [gaussians, 3]; whether others hide them is not asked."""
-    viewmats, Ks = (
-        np.stack(poses).astype(np.float64) for poses in zip(*((v.viewmat, v.K) for v in views), strict=True)
-    )
+    viewmats, Ks = np.stack([view.viewmat for view in views]), np.stack([view.K for view in views])
+    sizes = np.array([(view.height, view.width) for view in views])
     centres = np.stack([invert_rigid(viewmat)[:3, 3] for viewmat in viewmats])
-    sizes = np.array([view.image.shape[:2] for view in views])
     found = np.zeros((len(means), 3), np.float32)
 
     def find(block: int) -> None:

@@ -119,7 +119,7 @@ class Optimiser:
         self.parameters = _parameters(gaussians, views, options)
         self.rasterizer = GradientRasterizer(self.parameters)
         self.depth = _median_depth(self.parameters, views)
-        directions = view_directions(self.parameters.means, views)
+        directions = view_directions(self.parameters.means, [view.target for view in views])
         self.directions = directions.means
         slope = max(1 - 2 / len(views), 0) / directions.spread  # colours of two views are on a line, whatever they are
         self.lr = _learning_rates(self.parameters, self.depth, slope, options)

@@ -3,16 +3,15 @@
 import numpy as np
 from idesplat.runtime.geometry.rigid import invert_rigid
 from idesplat.runtime.refinement.directions import LEAST_SPREAD, view_directions
-from idesplat.runtime.refinement.refine import PosedImage
+from idesplat.runtime.refinement.rasterizer import Target
 from views_in_a_row import extrinsics_in_a_row
 
 K = np.array([[8.0, 0, 8], [0, 8, 8], [0, 0, 1]])  # of 16 pixels: the image ends at 45 degrees
 
 
-def views_from(*positions: float) -> list[PosedImage]:
+def views_from(*positions: float) -> list[Target]:
     """Views along z from places on the x axis."""
-    image, valid = np.zeros((16, 16, 3), np.float32), np.ones((16, 16), bool)
-    return [PosedImage(image, invert_rigid(pose), K, valid) for pose in extrinsics_in_a_row(*positions)]
+    return [Target(invert_rigid(pose), K, 16, 16) for pose in extrinsics_in_a_row(*positions)]
 
 
 def test_mean_and_spread_of_two_views() -> None:

@@ -266,7 +266,7 @@ def test_colours_that_follow_the_direction_turn_about_its_mean(
     before = with_degree_1(wrong_colours)
     rates = {field.name: 0.0 for field in fields(RefinementOptions) if field.name.startswith("lr_")}
     after = refine(before, views, RefinementOptions(steps=9, **{**rates, "lr_sh_1": 4.5e-3})).gaussians
-    directions = view_directions(before.means, views).means
+    directions = view_directions(before.means, [view.target for view in views]).means
     some = directions.any(axis=1)
     basis = sh_basis(directions[some], 4)[:, :, None]
     assert len(after) == len(before)
