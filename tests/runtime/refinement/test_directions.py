@@ -34,3 +34,8 @@ def test_one_view_and_views_from_one_place_have_the_least_spread() -> None:
     assert view_directions(point, views_from(0)).spread == LEAST_SPREAD
     assert view_directions(point, views_from(0, 0)).spread == LEAST_SPREAD
     assert not view_directions(point, views_from(0)).means.any()
+
+
+def test_a_scene_without_gaussians_has_the_least_spread() -> None:
+    found = view_directions(np.zeros((0, 3), np.float32), views_from(-1, 1))
+    assert found.means.shape == (0, 3) and found.spread == LEAST_SPREAD

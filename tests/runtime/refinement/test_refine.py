@@ -281,3 +281,9 @@ def test_two_views_tell_nothing_of_colours_that_follow_the_direction(
     after = refine(with_degree_1(wrong_colours), views[:2], RefinementOptions(steps=6)).gaussians
     assert after.sh[:, 0].std() > 0
     np.testing.assert_array_equal(after.sh[:, 1:], 0)
+
+
+def test_a_scene_without_gaussians_stays_empty(views: list[PosedImage]) -> None:
+    empty = with_degree_1(scene(0)).select(np.zeros(0, int))
+    refined = refine(empty, views, RefinementOptions(steps=3))
+    assert len(refined.gaussians) == 0 and np.isnan(refined.mean_psnr()[0])
