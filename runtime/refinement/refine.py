@@ -218,7 +218,7 @@ def _coarse(gaussians: Gaussians, views: Sequence[PosedImage]) -> np.ndarray:
         z = _depths(gaussians.means, view)
         seen = z > 0
         sizes[seen] = np.minimum(sizes[seen], shortest[seen] / z[seen])
-    return sizes > COARSE * np.median(sizes)
+    return sizes > COARSE * np.median(sizes) if len(sizes) else np.zeros(0, bool)
 
 
 def _gaussians(parameters: Parameters) -> Gaussians:

@@ -283,6 +283,7 @@ def test_two_views_tell_nothing_of_colours_that_follow_the_direction(
     np.testing.assert_array_equal(after.sh[:, 1:], 0)
 
 
+@pytest.mark.filterwarnings("error")
 def test_a_scene_without_gaussians_stays_empty(views: list[PosedImage]) -> None:
     empty = with_degree_1(scene(0)).select(np.zeros(0, int))
     refined = refine(empty, views, RefinementOptions(steps=3))
