@@ -22,5 +22,5 @@ def thread_count() -> int:
 
 def map_in_threads(task: Callable[[int], Result], count: int, threads: int | None = None) -> list[Result]:
     """What a task gives for the numbers from 0 to `count` - 1, in their order. threads: by default `thread_count()`."""
-    with ThreadPoolExecutor(max(min(count, threads or thread_count()), 1)) as pool:
+    with ThreadPoolExecutor(threads or thread_count()) as pool:  # which starts no more than it has tasks
         return list(pool.map(task, range(count)))

@@ -265,12 +265,12 @@ def test_colours_that_follow_the_direction_turn_about_its_mean(
     """Where SH of degree 1 alone has a learning rate, a colour stays the same in the mean direction."""
     before = with_degree_1(wrong_colours)
     rates = {field.name: 0.0 for field in fields(RefinementOptions) if field.name.startswith("lr_")}
-    after = refine(before, views, RefinementOptions(steps=9, **{**rates, "lr_sh_1": 4.5e-3})).gaussians
+    after = refine(before, views, RefinementOptions(steps=9, **{**rates, "lr_sh_1": 0.03})).gaussians
     directions = view_directions(before.means, [view.target for view in views]).means
     some = directions.any(axis=1)
     basis = sh_basis(directions[some], 4)[:, :, None]
     assert len(after) == len(before)
-    assert np.abs(after.sh[some, 1:]).max() > 0.02
+    assert np.abs(after.sh[some, 1:]).max() > 0.1
     np.testing.assert_allclose((basis * after.sh[some]).sum(axis=1), SH_0 * before.sh[some, 0], atol=1e-5)
     np.testing.assert_array_equal(after.sh[~some, 1:], 0)
 
